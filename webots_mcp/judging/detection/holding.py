@@ -40,9 +40,10 @@ class LostGrip(NamedTuple):
 def grips_in(search: Search) -> list[Grip]:
     """Return the forces and pressures of grippers, each with the command in its branch."""
     known, whole = search.known, search.whole
+    branches = {name: own.rpartition(".")[0] for name, own in search.own_names.items()}
     found: list[Grip] = []
     for name, meaning in search.meanings.items():
-        branch = name.rpartition(".")[0]
+        branch = branches[name]
         words = frozenset(words_in(name))
         if meaning.quantity not in ("force", "pressure") or meaning.sets or name not in whole:
             continue
@@ -51,7 +52,7 @@ def grips_in(search: Search) -> list[Grip]:
         commands = [
             each
             for each in known
-            if each.rpartition(".")[0] == branch and is_asked_for(each) and each in whole
+            if branches[each] == branch and is_asked_for(each) and each in whole
             if branch or not frozenset(words_in(each)).isdisjoint(words & _GRIPPING)
         ]
         if len(commands) == 1 and known[commands[0]].is_number:

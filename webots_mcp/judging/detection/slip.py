@@ -109,7 +109,7 @@ def _own_height(search: Search) -> RegisteredSignal | None:
         search.known[name]
         for name, meaning in search.meanings.items()
         if meaning.quantity == "height" and meaning.is_sensed and name in search.whole
-        if _OWN_HEIGHT.issuperset(words_in(name))
+        if _OWN_HEIGHT.issuperset(words_in(search.own_names[name]))
     )
     return search.motion.height or next(others, None)
 

@@ -243,7 +243,8 @@ def own_names(names: Iterable[str]) -> dict[str, str]:
     if len(tops) != 1 or not _TELLING.isdisjoint(words_in(top := next(iter(tops)))):
         return found
     below = f"{top}."
-    if not any(own.startswith(below) for own in found.values()):
+    parts = [own.removeprefix(below) for own in found.values() if own.startswith(below)]
+    if not parts or any(part[:1].isdigit() for part in parts):  # items of one array
         return found
     return {name: _without_containers(own.removeprefix(below)) for name, own in found.items()}
 
@@ -251,7 +252,7 @@ def own_names(names: Iterable[str]) -> dict[str, str]:
 @lru_cache(maxsize=_CACHE.names)
 def _without_containers(name: str) -> str:
     top, _, rest = name.partition(".")
-    while rest and _CONTAINERS.issuperset(words_in(top)) and not rest[0].isdigit():
+    while rest and not rest[0].isdigit() and _CONTAINERS.issuperset(words_in(top)):
         name = rest
         top, _, rest = name.partition(".")
     return name

@@ -54,7 +54,8 @@ what recording costs.
 `tests/cases` rebuilds situations from public reports as recordings, with the answer that an expert
 would give. The rules were made with the first two groups in view. For the other groups, the
 right answers were written down before webots-mcp was first asked; then some rules were improved. In
-the third group, a right answer earns 2 points, a helpful one 1, a false one -1. That gave {first} of {most} points at first, {now}
+the third group, a right answer earns 2 points, a helpful one 1, a false one -1. That gave
+{first} of {most} points at first, {now}
 today."""
 _SIMULATED: Final = """\
 ## All figures
@@ -66,7 +67,8 @@ _METHOD: Final = """\
 
 `python -m tests.accuracy` measures everything and writes these pages in an hour or two; no figure
 is written by hand. `python -m tests.accuracy loop` measures one part. Durations are those of one
-busy machine, so compare ratios. On the linked pages, a share has its 95 % interval in parentheses."""
+busy machine, so compare ratios. On the linked pages, a share has its 95 % interval in
+parentheses."""
 _RIGHT: Final = 2  # points of a situation that is answered rightly
 
 

@@ -27,7 +27,7 @@ PLAIN: dict[str, Any] = {
     "deep": {"x": None, "y": [[1]]},
 }
 VALUES = LEAVES | st.sampled_from(
-    [2**63, 2**64 - 1, -(2**63) - 1, 10**40, math.nan, math.inf, "null"]
+    [2**63, 2**64 - 1, -(2**63) - 1, 10**40, math.nan, math.inf, "null", "\ud800b", "ä"]
 )
 
 

@@ -142,6 +142,8 @@ def _encode_alike(state: object, read: Callable[[object], tuple[Any, ...]]) -> s
             return None
         if orjson is None:
             text = _encode_with_json(state)
+            if not text.isascii():
+                text.encode()  # fails where half a surrogate pair stands
         else:
             data: bytes = orjson.dumps(state)
             nulls = data.count(b"null")

@@ -11,10 +11,11 @@ Standard library only, because the bridge imports it inside a robot's controller
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from functools import lru_cache
 from itertools import pairwise
-from typing import Any, Final, Literal, NamedTuple, get_args
+from typing import Any, Final, Literal, NamedTuple, cast, get_args
 
 from webots_mcp.signals.naming import (
     BRANCHES,
@@ -113,6 +114,8 @@ _OF_HEADINGS: Final = frozenset((  # what measures a heading, and words next to 
     "attitude", "orientation", "euler", "rpy", "ahrs", "filtered", "pose", "position", "location",
     "vehicle", "drone", "car", "rover",
 )) | _MEASURED | _TARGET | _COMMAND  # fmt: skip
+_ATTITUDE: Final[tuple[Quantity, ...]] = ("roll", "pitch", "heading")  # the items of `rpy`
+_ATTITUDE_ITEMS: Final = re.compile(r"\.([012])$")
 _TURNING: Final = frozenset(("angular", "turn", "rotation", "steer"))
 _HEIGHTS: Final = frozenset(("height", "altitude"))
 _GYROS: Final = frozenset(("gyro", "imu", "gyroscope"))
@@ -160,8 +163,8 @@ _NO_SPEED: Final = frozenset((
 ))  # fmt: skip
 _OF_SPEEDS: Final = frozenset((
     "speed", "velocity", "robot", "forward", "linear", "command", "target", "measured", "actual",
-    "m", "mm", "cm", "s", "km", "h", "ps", "mps", "setpoint", "desired", "reference", "body",
-    "gps", "base", "odometry", "sensor",
+    "m", "mm", "cm", "s", "km", "h", "kmh", "kph", "ps", "mps", "setpoint", "desired", "reference",
+    "body", "gps", "base", "odometry", "sensor",
 ))  # fmt: skip
 
 # Branches that hold all sorts of things of the robot itself.
@@ -737,6 +740,10 @@ def _quantity_in(name: str, kind: str, base: str, names: frozenset[str]) -> Quan
         return _UNIT_QUANTITIES[unit]
     if last in _MORE_UNITS and len(words) > 1:
         return _MORE_UNITS[last]
+    if last in ("roll", "pitch") and unit in (None, "rad", "deg"):
+        return cast("Quantity", last)
+    if (turned := _ATTITUDE_ITEMS.search(name)) is not None and "rpy" in said:
+        return _ATTITUDE[int(turned[1])]
     if kind == "angle" or angle_unit(name) is not None or unit in ("rad", "deg"):
         if said & _JOINTS:
             return "joint position"
@@ -775,6 +782,8 @@ def _motion_in(
         return "motor speed"
     if said & _JOINTS:
         return "joint speed" if is_rate or is_speed else None
+    if not (is_rate or is_speed) and (unit in ("rad", "deg") or _is_sensor_of_turns(name)):
+        return None  # how far it has turned
     if "wheel" in said and not said & _NO_SPEED:
         return "wheel speed"
     if said & _GYROS:
@@ -795,6 +804,12 @@ def _motion_in(
     if is_speed and said <= _OF_SPEEDS:
         return "speed"
     return None
+
+
+def _is_sensor_of_turns(name: str) -> bool:
+    """Return whether it is a position sensor of a wheel or a motor, which gives an angle."""
+    parts = (frozenset(words_in(part)) for part in name.split("."))
+    return any("sensor" in words and words & {"wheel", "motor"} for words in parts)
 
 
 def _has_other_side(name: str, side: str, names: frozenset[str]) -> bool:

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator
 from typing import Any, Final, cast
 
-from webots_mcp.analysis.arrays import Array, Indexes, RowSpan, median, np, runs_of
+from webots_mcp.analysis.arrays import Array, Indexes, RowSpan, median, noise_of, np, runs_of
 from webots_mcp.analysis.summary import usable_part
 from webots_mcp.judging.checks.check import Examined, RunUnderCheck, times, total_s
 from webots_mcp.judging.detection.event import Event, NotSearchableError
@@ -43,6 +43,7 @@ NO_COMMAND: Final = (
 _LEAST_CELLS: Final = 10  # rows that two measurements are compared in
 _OF_RANGE: Final = 0.1  # of a target's whole range: what is apart by more is not there
 _NEARER: Final = 0.002  # of that range, within `APART_S`: what comes so much nearer is on its way
+_PARTS: Final = (500, 250, 125, 60, 30)  # of a path, of which its length is measured
 _NOISE: Final = 6.0  # standard deviations; for half as many it may come nearer by chance
 _HOLDING: Final = frozenset(("gripper", "finger", "hand", "claw", "jaw"))  # they close on things
 _FITTED: Final = 0.2  # of the way: so much of it lays one estimate over the other
@@ -85,7 +86,9 @@ def moves_when_commanded(run: RunUnderCheck) -> Examined:
 def rests_when_commanded(run: RunUnderCheck) -> Examined:
     """Warns where it turned by 0.1 rad or went 5 cm while every command was 0."""
     motion = run.motion
-    commands = [*filter(None, (motion.commanded, motion.turn_command)), *motion.wheel_commands]
+    of_body = (motion.commanded, motion.sideways, motion.turn_command)
+    commands = [*filter(None, of_body), *motion.wheel_commands]
+    commands = [each for each in commands if each.name in run.frame]
     if not commands:
         raise NotSearchableError(
             "no command is recorded: publish the commanded speed, such as commanded_m_s"
@@ -362,11 +365,11 @@ def _drift(
         return None
     a: Any = both[0][there] + 1j * both[1][there]
     b: Any = both[2][there] + 1j * both[3][there]
-    thin = max(1, len(there) // 500)
-    way_m: Array = np.abs(np.diff(a[::thin])).cumsum()
-    if way_m[-1] < _LEAST_WAY_M or np.abs(np.diff(b[::thin])).sum() < 0.2 * way_m[-1]:
+    way_m, rows = _way_of(a)
+    other_m = float(_way_of(b)[0][-1])
+    if way_m[-1] < _LEAST_WAY_M or other_m < 0.2 * way_m[-1]:
         return None
-    first = max(5, int(np.count_nonzero(way_m < _FITTED * way_m[-1])) * thin)
+    first = max(5, int(np.count_nonzero(way_m < _FITTED * way_m[-1])) * rows)
     a, b = a - a[:first].mean(), b - b[:first].mean()
     off = min((_laid_over(a, each, first) for each in (b, b.conj())), key=lambda each: each.max())
     is_apart = off[:first].max() > max(_SAME * _FITTED * way_m[-1], 0.1)
@@ -376,7 +379,7 @@ def _drift(
     warns_m, fails_m = (max(share * way_m[-1], least) for share, least in (_WARNS, _FAILS))
     worst_m = float(off.max())
     evidence = f"{names}: {worst_m:.3g} m apart at most, of a path of {way_m[-1]:.3g} m"
-    ratio = float(np.abs(np.diff(b[::thin])).sum() / way_m[-1])
+    ratio = other_m / float(way_m[-1])
     if not 1 / _OTHER_LENGTH < ratio < _OTHER_LENGTH:
         evidence += f"; the second path is {ratio:.3g} times as long"
     if worst_m <= warns_m:
@@ -515,6 +518,23 @@ def _in_one_unit(signal: RegisteredSignal, values: Array) -> Array:
         return values * (math.tau / signal.turn)
     unit = signal.unit or ""
     return values * SPEED_UNITS.get(unit, METRES.get(unit, 1.0))
+
+
+def _way_of(path: Any) -> tuple[Array, int]:
+    """How far it went up to the end of each part of a path, beyond noise, and the rows of a part.
+
+    Places are the means of parts. There are as many parts as show motion: with few parts noise
+    hardly adds to the way, and with many ones curves are not cut short.
+    """
+    noise_m = math.hypot(noise_of(path.real), noise_of(path.imag))
+    steps, least_m, rows = np.zeros(0), 0.0, 1
+    for parts in _PARTS:
+        rows = max(1, len(path) // parts)
+        means: Any = np.reshape(path[: len(path) // rows * rows], (-1, rows)).mean(axis=1)
+        steps, least_m = np.abs(np.diff(means)), _NOISE * noise_m / math.sqrt(rows)
+        if float(np.quantile(steps, 0.9)) > 2 * least_m:
+            break
+    return np.where(steps > least_m, steps, 0.0).cumsum(), rows
 
 
 def _laid_over(a: Any, b: Any, first: int) -> Array:

@@ -16,8 +16,16 @@ from webots_mcp.judging.detection.event import Event
 from webots_mcp.judging.detection.jump import JUMP
 from webots_mcp.judging.detection.sensors import FLAT, MOST_REPEATED, OTHER_ROWS, is_noisy
 from webots_mcp.judging.verdicts import Fault
-from webots_mcp.signals.meaning import CAN_BE_OFF, INERT, Meaning
-from webots_mcp.signals.naming import REDUCTIONS, SOLIDS, WORLD, counted, find_targets, listed
+from webots_mcp.signals.meaning import CAN_BE_OFF, INERT, Meaning, Quantity, words_in
+from webots_mcp.signals.naming import (
+    ELSEWHERE,
+    REDUCTIONS,
+    SOLIDS,
+    WORLD,
+    counted,
+    find_targets,
+    listed,
+)
 from webots_mcp.store.reading.frame import Frame
 from webots_mcp.store.registered_signals import RegisteredSignal, stored_roles
 
@@ -27,6 +35,13 @@ _MANY: Final = 0.05  # of the rows that are NaN: a sensor has none in its first 
 _LEAST_S: Final = 1.0  # as of what is missing
 _AT_LIMIT: Final = 0.05  # of the rows
 _OBSERVED: Final = (f"{WORLD}.", f"{SOLIDS}.")
+_SPEEDS: Final = frozenset[Quantity | None]((
+    "speed", "turn rate", "wheel speed", "motor speed", "joint speed",
+))  # fmt: skip
+# What comes into sight and leaves it.
+_THINGS: Final = ELSEWHERE | {
+    "beacon", "car", "gap", "headway", "lead", "leader", "person", "tag", "vehicle",
+}  # fmt: skip
 _MANY_VALUES: Final = 100  # different ones: of fewer one comes back by nature
 _OFTEN_THE_SAME: Final = 3
 _CUT_OFF: Final = 5  # times at one extreme to the last digit: of values that never repeat none is
@@ -305,6 +320,8 @@ def _saturated(run: RunUnderCheck) -> Iterator[tuple[str, float, float, float, i
         quantity = run.meanings[name].quantity
         if name in names.place or signal.turn or names.target(name) or quantity == "distance":
             continue
+        if quantity in _SPEEDS and run.meanings[name].role != "measured":
+            continue  # it may be what a controller sets, which has a greatest value by design
         zones = run.frame.zone_map(name)
         if zones.change_count.sum() < _MANY_VALUES or not _is_often_at_an_end(run.frame, name):
             continue
@@ -422,6 +439,8 @@ def _is_dropout(run: RunUnderCheck, jump: Event) -> bool:
     if quantity == "distance":  # other things may pass a sensor, but not at its very ends
         if run.search.known[name].reduction in ("min", "max"):  # whatever passes is the least
             return float(jump.details["after"]) == 0
+        if float(jump.details["after"]) < 0 or not _THINGS.isdisjoint(words_in(name)):
+            return False  # nothing is in sight: no distance is negative
         zones = run.frame.zone_map(name)
         ends = (0.0, float(np.nanmin(zones.min)), float(np.nanmax(zones.max)))
         return float(jump.details["after"]) in ends

@@ -32,6 +32,7 @@ _DIFFERENCE_VARIANCE: Final = 70.0  # ... so many times its variance
 _OUTLIER: Final = 4.0  # standard deviations of the larger noise; more does not count more
 _SAME_MOTION: Final = 2.0  # times as fast: then the motion may explain the noise
 _NEAR_BLOCKS: Final = 2  # before and after: something else that changed then may explain the noise
+_PROPORTIONAL: Final = 2.0  # times the ratio of distances: so much more noise may be theirs
 _LEFT: Final = 5.0  # times the range, or the noise, that a height had kept before
 _FEW: Final = 0.1  # of the rows after that may lie in the former range
 _DEPTHS: Final = frozenset(("depth", "altitude"))
@@ -81,7 +82,7 @@ def degradation_events(search: Search) -> Iterator[Event]:
         if found is None:
             continue
         start_s, before, after = found
-        if why := _explained_by(search, signal, start_s):
+        if why := _explained_by(search, signal, start_s, after / before):
             excused.append((signal.name, before, after, start_s, why))
             continue
         found_any = True
@@ -146,18 +147,25 @@ def _change_of(search: Search, signal: RegisteredSignal) -> tuple[float, float, 
     return float(times[row]), before, after
 
 
-def _explained_by(search: Search, signal: RegisteredSignal, start_s: float) -> str | None:
+def _explained_by(
+    search: Search, signal: RegisteredSignal, start_s: float, times_noise: float
+) -> str | None:
     """Return what else changed for good when the noise of a signal grew; None where nothing did.
 
     A receiver below the surface, or off the ground, measures in other surroundings. What counts is
     a mode that begins then and was never there before, and a height or depth that leaves then the
-    range that it had kept.
+    range that it had kept. The noise of a distance grows with the distance.
     """
     frame, margin_s = search.frame, (search.length_s / _BLOCKS) * _NEAR_BLOCKS
     before = frame.between(search.began_s, start_s - margin_s)
     after = frame.between(start_s + margin_s, search.ended_s)
     if len(before) < 2 or len(after) < 2:
         return None
+    if search.meanings[signal.name].quantity == "distance":
+        near, far = (part.usable(signal.name)[1] for part in (before, after))
+        levels = [float(np.median(np.abs(each))) if len(each) else 0.0 for each in (near, far)]
+        if levels[0] > 0 and times_noise <= _PROPORTIONAL * levels[1] / levels[0]:
+            return f"it measured {levels[1] / levels[0]:.2g} times as far"
     mode = search.motion.mode
     if mode is not None and mode.name in frame:
         codes, labels = frame.coded(mode.name)

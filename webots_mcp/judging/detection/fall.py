@@ -20,6 +20,7 @@ from webots_mcp.judging.detection.search import (
     in_metres,
     is_counted_by_wheels,
 )
+from webots_mcp.signals.meaning import words_in
 from webots_mcp.signals.naming import SOLIDS, WORLD
 from webots_mcp.store.reading.frame import Frame
 from webots_mcp.store.registered_signals import RegisteredSignal
@@ -29,6 +30,7 @@ FALLEN_RAD: Final = math.radians(60)  # ... beyond this it has tipped over ...
 DOWN_RAD: Final = math.radians(45)  # ... and beyond this it lies
 SETTLED_S: Final = 1.0  # for so long each of them has to last
 MOVES_M_S: Final = 0.1  # what lies is slower in most seconds ...
+_DEGREES: Final = 360.0
 _BETWEEN: Final = math.tan(math.radians(67.5))  # nearer to one side than to between two sides
 _NOISE: Final = 6.0  # ... but for so many standard deviations of a second's mean place
 _FALLEN_DEG: Final = math.degrees(FALLEN_RAD)
@@ -176,10 +178,8 @@ def tilt_of(frame: Frame, roll: RegisteredSignal | None, pitch: RegisteredSignal
         pitch: As `roll`.
     """
     angles = [
-        np.zeros(len(frame))
-        if each is None
-        else frame.bridged(each.name, each.turn or math.tau) * math.tau / (each.turn or math.tau)
-        for each in (roll, pitch)
+        np.zeros(len(frame)) if each is None else frame.bridged(each.name, turn) * math.tau / turn
+        for each, turn in zip((roll, pitch), _turns_of(frame, roll, pitch), strict=True)
     ]
     there = np.isfinite(angles[0]) & np.isfinite(angles[1])
     across, along = (each[there] for each in angles)
@@ -193,6 +193,27 @@ def tilt_of(frame: Frame, roll: RegisteredSignal | None, pitch: RegisteredSignal
     ahead: Array = np.array([1.0, 0.0, 0.0]) - first[0] * first
     ahead /= float(np.linalg.norm(ahead)) or 1.0
     return Tilt(times, tilt, ahead @ up, np.cross(first, ahead) @ up)
+
+
+def _turns_of(
+    frame: Frame, roll: RegisteredSignal | None, pitch: RegisteredSignal | None
+) -> Iterator[float]:
+    """Return a whole turn of both: those without a unit are degrees where one exceeds 2 pi."""
+    known = {each.name: each.turn for each in (roll, pitch) if each is not None}
+    open_ones = [
+        each
+        for each in (roll, pitch)
+        if each is not None and each.stated_unit is None and each.turn != _DEGREES
+        if "rad" not in words_in(each.name)
+    ]
+    if any(_farthest(frame, each.name) > math.tau for each in open_ones):
+        known |= {each.name: _DEGREES for each in open_ones}
+    return ((each and known[each.name]) or math.tau for each in (roll, pitch))
+
+
+def _farthest(frame: Frame, name: str) -> float:
+    zones = frame.zone_map(name)
+    return max(float(np.nanmax(zones.max)), -float(np.nanmin(zones.min)))
 
 
 def attitudes_in(search: Search) -> list[Attitude]:

@@ -20,7 +20,7 @@ from webots_mcp.judging.detection.event import Alike, Event, NotAskedError, NotS
 from webots_mcp.judging.detection.event_options import EventOptions
 from webots_mcp.judging.verdicts import Cause, JudgedInterval, SearchCoverage
 from webots_mcp.signals.meaning import INPUTS, Meaning, Quantity, own_names, words_in
-from webots_mcp.signals.naming import FARTHEST_M, listed, unit_in
+from webots_mcp.signals.naming import FARTHEST_M, listed, unit_in, words_of
 from webots_mcp.signals.register import first_in, pair_in
 from webots_mcp.store.chunks import shown
 from webots_mcp.store.meanings import meanings_of
@@ -42,6 +42,8 @@ AWAY_S: Final = 20.0
 LEAST_NOISE: Final = 8.0  # deviations of what is left of the noise
 USUALLY_STANDS: Final = 4  # times as many visits as it moves in, of at least so many visits
 LEAST_VISITS: Final = 3
+_AHEAD: Final = frozenset(("x", "vx", "forward", "ahead", "0"))
+_ASIDE: Final = frozenset(("y", "vy", "sideways", "sideway", "lateral", "strafe", "side", "1"))
 _ODOMETRY: Final = frozenset(("odometry",))
 _OF_MOTION: Final = ("speed", "turn rate", "wheel speed", "heading")
 EARLIER_RUNS: Final = 3
@@ -80,6 +82,7 @@ class Motion:
             are speeds that these should have.
         height: z: a robot that climbs does not stand still.
         turn_command: How fast it should turn.
+        sideways: How fast it should go to its side, as a robot with omnidirectional wheels can.
     """
 
     position: tuple[RegisteredSignal, RegisteredSignal] | None
@@ -91,6 +94,7 @@ class Motion:
     height: RegisteredSignal | None = None
     wheel_commands: tuple[RegisteredSignal, ...] = ()
     turn_command: RegisteredSignal | None = None
+    sideways: RegisteredSignal | None = None
 
     @property
     def signals(self) -> list[RegisteredSignal]:
@@ -103,7 +107,15 @@ class Motion:
         """All of them."""
         others = filter(
             None,
-            (self.height, self.commanded, self.turn_command, self.speed, self.mode, self.heading),
+            (
+                self.height,
+                self.commanded,
+                self.sideways,
+                self.turn_command,
+                self.speed,
+                self.mode,
+                self.heading,
+            ),
         )
         return [*(self.position or ()), *others, *self.wheels, *self.wheel_commands]
 
@@ -185,7 +197,29 @@ def find_motion(
         height=declared.get("height") or signals.get(f"z{place}"),
         wheel_commands=tuple(each for each in wheel_commands if each != commanded),
         turn_command=next(iter(meant("turn rate", sets=True)), None),
+        sideways=None if commanded is None else _sideways_of(commanded, known),
     )
+
+
+def _sideways_of(
+    commanded: RegisteredSignal, known: dict[str, RegisteredSignal]
+) -> RegisteredSignal | None:
+    """The command to go sideways that stands next to one to go ahead: `cmd.vy` next to `cmd.vx`.
+
+    The second item of an array is one only if there is a third, which then is the turn rate.
+    """
+    words = frozenset(_parts_of(commanded.name)) - _AHEAD
+    for name, signal in known.items():
+        own = frozenset(_parts_of(name))
+        if name == commanded.name or not signal.is_number or own & _AHEAD or own - _ASIDE != words:
+            continue
+        if own & _ASIDE and ("1" not in own or f"{name[:-1]}2" in known):
+            return signal
+    return None
+
+
+def _parts_of(name: str) -> Iterator[str]:
+    return (word for part in name.split(".") for word in words_of(part))
 
 
 def _heading_among(meant: Callable[..., list[RegisteredSignal]]) -> RegisteredSignal | None:

@@ -146,6 +146,9 @@ class Standings:
         least = 0.0
         if self.speed is not None and self.speed.name in frame:
             self.speeds = frame.bridged(self.speed.name)[rows]
+            if motion.sideways is not None and motion.sideways.name in frame:
+                aside = np.nan_to_num(frame.bridged(motion.sideways.name)[rows])
+                self.speeds = np.where(aside == 0, self.speeds, np.hypot(self.speeds, aside))
             least_m_s = options.min_commanded_m_s / SPEED_UNITS.get(self.speed.unit or "m/s", 1.0)
             least = max(least_m_s, COMMAND_NOISE * noise.of(self.speed.name))
         self.told = np.abs(self.speeds) >= least

@@ -177,3 +177,47 @@ def test_positions_of_a_robot_that_waits_before_it_drives_agree(noise_m: float) 
 
     with asked(draw, 110.0) as recording:
         assert outcomes_of(recording)["estimates agree"] == "pass"
+
+
+@pytest.mark.parametrize("names", ["left_encoder right_encoder", "leftTicks rightTicks"])
+def test_a_counter_that_stands_still_while_the_other_side_counts_froze(names: str) -> None:
+    def draw(t: Array, random: Random) -> Columns:
+        went, columns = driving(t, random)
+        counts = np.floor(went * 5000)
+        frozen = np.where(t > 31, counts[np.argmax(t > 31)], counts)
+        return columns | dict(zip(names.split(), (frozen, counts), strict=True))
+
+    with asked(draw) as recording:
+        assert "sensors live" in complaints(recording)
+
+
+def test_a_signal_of_unknown_meaning_that_goes_to_0_again_and_again_is_not_passed() -> None:
+    def draw(t: Array, random: Random) -> Columns:
+        _, columns = driving(t, random)
+        gone = (t % 15 > 12) & (t % 15 < 12.15)
+        return columns | {"cliffLeft": np.where(gone, 0.0, 2.6 + noise(random, t, 0.01))}
+
+    with asked(draw) as recording:
+        assert len(recording.events("jump").events) >= 3
+        assert outcomes_of(recording)["sensors drop nothing"] == "not judged"
+
+
+# -- episodes --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["episode", "info.done", None])
+def test_a_robot_that_is_put_back_for_an_episode_did_not_jump(name: str | None) -> None:
+    def draw(t: Array, random: Random) -> Columns:
+        moves = (t % 20 > 2) & (t % 20 < 17)
+        columns: dict[str, Any] = {
+            "gps.x": 0.25 * np.clip(t % 20 - 2, 0, 15) + noise(random, t, 1e-3),
+            "gps.y": noise(random, t, 1e-3),
+            "cmd_vel": 0.25 * moves,
+        }
+        if name is not None:
+            columns[name] = t // 20 if name == "episode" else (t % 20 < 0.1).tolist()
+        return columns
+
+    with asked(draw) as recording:
+        expected = ["stays in place"] if name is None else []
+        assert complaints(recording) == expected

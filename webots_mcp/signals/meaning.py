@@ -73,7 +73,8 @@ _SHORT_FORMS: Final = {
     "baro": "pressure", "barometer": "pressure", "illuminance": "light", "brightness": "light",
     "proximity": "distance", "ps": "distance", "ds": "distance", "ir": "distance",
     "clearance": "distance", "sonar": "distance", "lidar": "distance", "range": "distance",
-    "ultrasonic": "distance",
+    "ultrasonic": "distance", "ultrasound": "distance", "tof": "distance", "laser": "distance",
+    "rangefinder": "distance",
 }  # fmt: skip
 _SIDES: Final = {
     "left": "left", "right": "right", "l": "left", "r": "right", "fl": "front left",

@@ -60,6 +60,7 @@ _MEASURES: Final = frozenset((
     "ahrs", "compass", "ekf", "estimate", "estimated", "filtered", "fused", "gps", "gyro", "imu",
     "mag", "magnetometer", "odom", "odometry", "pose", "position", "sensor", "true",
 ))  # fmt: skip
+_EPISODES: Final = frozenset(("episode", "trial", "reset", "done", "terminated", "truncated"))
 _HEADINGS: Final = frozenset(("attitude", "deg", "degree", "euler", "heading", "rad", "rpy", "yaw"))
 
 
@@ -107,7 +108,10 @@ def rests_when_commanded(run: RunUnderCheck) -> Examined:
         never = f"{names} {was} never 0" + f" for {least_s:g} s" * bool(idle.any())
         raise NotSearchableError(f"it was never commanded to rest: {never}")
     moved: list[tuple[RowSpan, str]] = []
+    leaps_s = [each.start_s for each in _leaps_in(run)]
     for rest in rests:
+        if any(rest.start_s <= leap_s <= rest.end_s for leap_s in leaps_s):
+            continue  # something put it elsewhere meanwhile, which another check tells
         part = frame.between(rest.start_s + ROLLS_OUT_S, just_after(rest.end_s))
         moved += ((rest, each) for each in _moved_in(run, part))
     if not moved:
@@ -551,15 +555,32 @@ def _are_own(*positions: tuple[RegisteredSignal, RegisteredSignal]) -> bool:
     )
 
 
+def _leaps_in(run: RunUnderCheck) -> list[Event]:
+    return [each for each in run.events(JUMP.name) if each.name == "position"]
+
+
+def _resets_in(run: RunUnderCheck) -> Array:
+    """When a counter of episodes went on, or a flag said that one is done: it is put back then."""
+    times: list[Array] = [np.zeros(0)]
+    for name in run.search.known:
+        if name in run.frame and not _EPISODES.isdisjoint(words_in(name)):
+            changes = np.flatnonzero(np.diff(run.frame.coded(name).codes)) + 1
+            times.append(run.frame.times[changes])
+    return np.concatenate(times)
+
+
 def stays_in_place(run: RunUnderCheck) -> Examined:
     """Warns where the position jumped: something put it elsewhere, or the estimate is wrong."""
     if run.motion.position is None:
         raise NotSearchableError("no position is recorded: publish gps or pose: [x, y], in metres")
-    leaps = [each for each in run.events(JUMP.name) if each.name == "position"]
+    resets, all_leaps = _resets_in(run), _leaps_in(run)
+    near_s = 2 * run.noise.interval_s * (1 + 1e-6)
+    leaps = [e for e in all_leaps if np.abs(resets - e.start_s).min(initial=math.inf) > near_s]
     if not leaps:
         limit = f"limit {run.search.options.jump_m:g} m"
         names = [each.name for each in run.motion.position]
-        return run.covered("its position never jumped", signals=names, limit=limit)
+        but = f" but at {counted(len(all_leaps), 'reset')}" if all_leaps else ""
+        return run.covered(f"its position never jumped{but}", signals=names, limit=limit)
     far_m = max(float(each.details.get("distance_m", 0.0)) for each in leaps)
     evidence = f"its position jumped {times(len(leaps))}, up to {far_m:.3g} m"
     return Fault("warn", evidence, leaps[0].start_s, len(leaps), run.more(JUMP.name))

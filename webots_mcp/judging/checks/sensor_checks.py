@@ -42,6 +42,7 @@ _SPEEDS: Final = frozenset[Quantity | None]((
 _THINGS: Final = ELSEWHERE | {
     "beacon", "car", "gap", "headway", "lead", "leader", "person", "tag", "vehicle",
 }  # fmt: skip
+_OTHER_SIDE: Final = {"left": "right", "right": "left"}
 _MANY_VALUES: Final = 100  # different ones: of fewer one comes back by nature
 _OFTEN_THE_SAME: Final = 3
 _CUT_OFF: Final = 5  # times at one extreme to the last digit: of values that never repeat none is
@@ -140,7 +141,7 @@ def _frozen(run: RunUnderCheck, flat: Event) -> Literal["fail", "warn"] | None:
     name, says = flat.name or "", str(flat.details.get("says", ""))
     names = _names_in(run)
     if name not in names.sensors or says.startswith("at "):
-        return None
+        return "warn" if _other_side_goes_on(run, flat) else None
     if says.startswith("frozen"):  # its target went on
         return "fail"
     meaning = run.meanings[name]
@@ -165,6 +166,18 @@ def _frozen(run: RunUnderCheck, flat: Event) -> Literal["fail", "warn"] | None:
         others = [e for e in flats if branches.get(e.name or "") != branches.get(name)]
     rests_s = (min(flat.end_s, e.end_s) - max(flat.start_s, e.start_s) for e in others)
     return None if sum(max(0.0, each) for each in rests_s) > flat.duration_s / 2 else "warn"
+
+
+def _other_side_goes_on(run: RunUnderCheck, flat: Event) -> bool:
+    """Whether a counter stood still while that of the other side counted in most rows."""
+    name = flat.name or ""
+    if run.meanings[name].quantity != "count" or run.meanings[name].side not in _OTHER_SIDE:
+        return False
+    words = [_OTHER_SIDE.get(word, word) for word in words_in(name)]
+    others = (each for each in run.search.numbers if list(words_in(each.name)) == words)
+    part = run.frame.between(flat.start_s, flat.end_s)
+    counted_on = (np.diff(part.usable(each.name)[1]) != 0 for each in others)
+    return any(len(each) > 0 and float(each.mean()) > MOSTLY for each in counted_on)
 
 
 def _is_at_rest(run: RunUnderCheck, flat: Event) -> bool:
@@ -405,11 +418,9 @@ def _are_unique(values: Array) -> bool:
 def sensors_drop_nothing(run: RunUnderCheck) -> Examined:
     """Warns where a signal went away and back at once, fails where it went to one value 3 times."""
     sensors = _names_in(run).sensors
-    gone = [
-        each
-        for each in run.events(JUMP.name)
-        if "back" in each.details and each.name in sensors and _is_dropout(run, each)
-    ]
+    spikes = [each for each in run.events(JUMP.name) if "back" in each.details]
+    gone = [each for each in spikes if each.name in sensors and _is_dropout(run, each)]
+    gone = gone or _often_gone(run, spikes)
     if not gone:
         near = run.found.verdicts.nearest.get(JUMP.name)
         return run.covered("none dropped out" + (f" ({near})" if near else ""), of=JUMP.name)
@@ -422,6 +433,17 @@ def sensors_drop_nothing(run: RunUnderCheck) -> Examined:
     outcome = "fail" if most >= _OFTEN_THE_SAME else "warn"
     more = run.more(JUMP.name)
     return Fault(outcome, evidence, gone[0].start_s, len(gone), more, signals=(name or "",))
+
+
+def _often_gone(run: RunUnderCheck, spikes: list[Event]) -> list[Event]:
+    """What went to 0 again and again, of signals of which nobody knows what they are."""
+    names = Counter(
+        each.name
+        for each in spikes
+        if run.meanings[each.name or ""].source == "unknown" and float(each.details["after"]) == 0
+    )
+    often = {name for name, count in names.items() if count >= _OFTEN_THE_SAME}
+    return [each for each in spikes if each.name in often and float(each.details["after"]) == 0]
 
 
 def _spike(jump: Event) -> str:

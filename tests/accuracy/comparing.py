@@ -230,8 +230,8 @@ def trials(bench: Bench) -> Iterator[str]:
         rows.append(row)
     alike = rankings * sum(not each for each, *_ in cases) * len(_REPEATS[1:])
     yield (
-        f"Of equal sets, repeated {_REPEATS[1]} times or more, one is wrongly confirmed as best in "
-        f"{false:,} of {alike:,} rankings."
+        f"In {false:,} of {alike:,} rankings of equally good sets of parameters, each repeated "
+        f"{_REPEATS[1]} times or more, one is wrongly confirmed as best."
     )
     yield _RANKED.format(rankings=f"{rankings:,}")
     heads = [f"{n} repeats: {what}" for n in _REPEATS for what in ("right", "wrong")]

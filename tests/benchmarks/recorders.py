@@ -274,8 +274,11 @@ def survival(bench: Bench) -> Iterator[str]:
         total = sum(lost)
         rows.append([name, f"{written:,}", f"{total:,}", f"{median(lost):,.0f}",
                      f"{max(lost):,}", f"{unread} of {kills}"])  # fmt: skip
-    ours = rows[list(WAYS).index("bridge")]
-    yield f"{ours[2]} of {ours[1]} states that the bridge had recorded were lost in {kills} kills."
+    ours, mcap = (rows[list(WAYS).index(each)] for each in ("bridge", "MCAP, as by default"))
+    yield (
+        f"In {kills} kills the bridge lost {ours[2]} of {ours[1]} recorded states, and MCAP with "
+        f"its defaults {mcap[2]} of {mcap[1]}."
+    )
     yield _KILLED.format(kills=kills)
     yield table(
         ("recorder", "states written", "lost", "by a kill, median", "most", "nothing readable"),

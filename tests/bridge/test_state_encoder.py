@@ -1,4 +1,4 @@
-"""A state of known keys is encoded in half of the time, to the same text as any other."""
+"""A state of known keys is encoded in less time, to the same text as any other."""
 
 from __future__ import annotations
 

@@ -12,6 +12,9 @@ import pytest
 
 from tests.cases.columns import Array, Random, noise, wrapped
 from tests.cases.situations import Columns, Recording, Situation, recorded
+from webots_mcp.judging.detection.event_options import EventOptions
+from webots_mcp.judging.detection.events import find_events
+from webots_mcp.store.reading.ranges import Scope, find_range
 
 INTERVAL_S: Final = 0.032
 
@@ -200,6 +203,33 @@ def test_a_signal_of_unknown_meaning_that_goes_to_0_again_and_again_is_not_passe
     with asked(draw) as recording:
         assert len(recording.events("jump").events) >= 3
         assert outcomes_of(recording)["sensors drop nothing"] == "not judged"
+
+
+@pytest.mark.parametrize("kind", ["flat", "jump", "missing", "oscillation", "degradation"])
+def test_every_kind_can_be_asked_of_one_item_of_a_long_array(kind: str) -> None:
+    def draw(t: Array, random: Random) -> Columns:
+        _, columns = driving(t, random)
+        scan = np.stack([2 + noise(random, t, 0.01) for _ in range(40)], axis=1)
+        scan[len(t) // 2 :, 12] = 2.0
+        return columns | {"scan": scan}
+
+    with asked(draw) as recording:
+        found = recording.events(kind, signals=["scan.12", "gps.x"])
+        assert {each.name for each in found.events} == ({"scan.12"} if kind == "flat" else set())
+        assert found.verdicts.why_unsearched(kind) is None
+
+
+def test_a_part_of_a_run_tells_degrees_as_the_whole_does() -> None:
+    def draw(t: Array, random: Random) -> Columns:
+        lies = np.clip((t - 30) / 0.6, 0, 1)
+        return {"roll": 86 * lies + noise(random, t, 0.2), "pitch": noise(random, t, 0.2)}
+
+    with asked(draw, 45.0) as recording:
+        part = find_range(recording.connection, Scope(run_id=1, start_s=5.0, end_s=20.0))
+        found = find_events(recording.connection, part, EventOptions(kinds=("fall",)))
+        assert not found.events
+        nearest = found.verdicts.nearest["fall"]
+        assert float(nearest.removeprefix("largest tilt was ").partition("°")[0]) < 3
 
 
 # -- episodes --------------------------------------------------------------------------------------

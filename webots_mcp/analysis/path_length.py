@@ -121,8 +121,9 @@ def tracks_of(
 ) -> list[SmoothedTrack]:
     """One track per stretch without a gap.
 
-    A gap is an interval in which rows are missing (see `find_gaps`), and that lasts so long that
-    what happened in it is unknown. The noise is that of the longest stretch, unless it is given.
+    A gap is an interval in which rows are missing (see `find_gaps`) and that is longer than a short
+    dropout: what happened in it is unknown. The noise is that of the longest stretch, unless it is
+    given.
     """
     gaps = find_gaps(times)
     ends_s = [gap.end_s for gap in gaps if gap.end_s - gap.start_s > LONGEST_DROPOUT_S]

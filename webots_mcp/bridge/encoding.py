@@ -79,7 +79,7 @@ def encode(state: object) -> Encoded:
 
 
 class StateEncoder:
-    """Encodes states as `encode` does, in half of the time while their keys stay the same.
+    """Encodes states as `encode` does, in two thirds of the time while their keys stay the same.
 
     A shape is learned only from a state that passed the check of `encode`. So of a state of the
     same shape only what may differ is checked: the kinds of its values, large integers, long texts

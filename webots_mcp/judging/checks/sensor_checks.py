@@ -436,7 +436,7 @@ def sensors_drop_nothing(run: RunUnderCheck) -> Examined:
 
 
 def _often_gone(run: RunUnderCheck, spikes: list[Event]) -> list[Event]:
-    """What went to 0 again and again, of signals of which nobody knows what they are."""
+    """Return what went to 0 again and again, of signals of unknown meaning."""
     names = Counter(
         each.name
         for each in spikes

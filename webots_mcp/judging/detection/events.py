@@ -209,6 +209,8 @@ def search_events(
     borders = _read_cursor(after) if after else {}
     kinds, known = asked_kinds(options), known_signals(connection, time_range)
     context = _context(known, options, around)
+    if known and tuple(options.signals) != EventOptions.signals:  # single items of arrays as well
+        known = {each.name: each for each in resolve_signals(known, options.signals)} | known
     import_module("numpy")  # once per process, before the time counts
     deadline, segments = Deadline(deadline_s), time_range.segments
     coverage = SearchCoverage(list(time_range.notes), of_several_runs=len(segments) > 1)

@@ -63,7 +63,8 @@ def fall_events(search: Search) -> Iterator[Event]:
         raise NotSearchableError(NO_ATTITUDE)
     are_known = False
     for attitude in attitudes:
-        tilted = tilt_of(search.frame, attitude.roll, attitude.pitch)
+        turns = _turns_of(search.whole, attitude.roll, attitude.pitch)
+        tilted = tilt_of(search.frame, attitude.roll, attitude.pitch, turns)
         times, tilt = tilted.times, tilted.tilt
         if len(times) < 2:
             continue
@@ -169,17 +170,23 @@ class Tilt(NamedTuple):
         return across if abs(left) > _BETWEEN * abs(ahead) else f"{along} {across}"
 
 
-def tilt_of(frame: Frame, roll: RegisteredSignal | None, pitch: RegisteredSignal | None) -> Tilt:
+def tilt_of(
+    frame: Frame,
+    roll: RegisteredSignal | None,
+    pitch: RegisteredSignal | None,
+    turns: tuple[float, float],
+) -> Tilt:
     """Return how a body is tilted.
 
     Args:
         frame: The rows.
         roll: None where only the pitch is known; it counts as 0 then.
         pitch: As `roll`.
+        turns: A whole turn of both.
     """
     angles = [
         np.zeros(len(frame)) if each is None else frame.bridged(each.name, turn) * math.tau / turn
-        for each, turn in zip((roll, pitch), _turns_of(frame, roll, pitch), strict=True)
+        for each, turn in zip((roll, pitch), turns, strict=True)
     ]
     there = np.isfinite(angles[0]) & np.isfinite(angles[1])
     across, along = (each[there] for each in angles)
@@ -196,8 +203,8 @@ def tilt_of(frame: Frame, roll: RegisteredSignal | None, pitch: RegisteredSignal
 
 
 def _turns_of(
-    frame: Frame, roll: RegisteredSignal | None, pitch: RegisteredSignal | None
-) -> Iterator[float]:
+    run: Frame, roll: RegisteredSignal | None, pitch: RegisteredSignal | None
+) -> tuple[float, float]:
     """Return a whole turn of both: those without a unit are degrees where one exceeds 2 pi."""
     known = {each.name: each.turn for each in (roll, pitch) if each is not None}
     open_ones = [
@@ -206,14 +213,15 @@ def _turns_of(
         if each is not None and each.stated_unit is None and each.turn != _DEGREES
         if "rad" not in words_in(each.name)
     ]
-    if any(_farthest(frame, each.name) > math.tau for each in open_ones):
+    if any(_exceeds_a_turn(run, each.name) for each in open_ones):
         known |= {each.name: _DEGREES for each in open_ones}
-    return ((each and known[each.name]) or math.tau for each in (roll, pitch))
+    of_roll, of_pitch = ((each and known[each.name]) or math.tau for each in (roll, pitch))
+    return of_roll, of_pitch
 
 
-def _farthest(frame: Frame, name: str) -> float:
-    zones = frame.zone_map(name)
-    return max(float(np.nanmax(zones.max)), -float(np.nanmin(zones.min)))
+def _exceeds_a_turn(run: Frame, name: str) -> bool:
+    zones = run.zone_map(name)
+    return bool((zones.max > math.tau).any() or (zones.min < -math.tau).any())
 
 
 def attitudes_in(search: Search) -> list[Attitude]:

@@ -201,9 +201,9 @@ def find_jumps(
 
     The usual step is that of all steps that are not zero and do not come back at once. There have
     to be ten of them: counters and commanded values change by steps all the time. Of a value that
-    otherwise rests only what comes back at once counts; and so of one that may step, and that is
-    ten thousand times as exact as it steps: physics engines let nothing rest quite. A step next to
-    one that has the same direction and is at least half as large is part of a motion, however
+    otherwise rests only what comes back at once counts. A value that may step also rests if its
+    steps are ten thousand times its noise: in a physics engine nothing is quite still. A step next
+    to one that has the same direction and is at least half as large is part of a motion, however
     quick, and no jump. After a gap a step may be larger by as many times as the gap is longer than
     the usual interval. The step of an angle over the end of its scale (pi, 180 degrees, 360
     degrees) is as large as what is left of a whole turn. The steps of a swing are no jumps.

@@ -94,7 +94,7 @@ def changes_in(zones: ZoneMap) -> int:
 
 
 def find_rests(frame: Frame, name: str, least_s: float) -> Iterator[RowSpan]:
-    """Where a signal kept its value for so long, also across short dropouts.
+    """Where a signal kept its value for at least that time, also across short dropouts.
 
     Opened are only the chunks with so many rows that repeat the one before, and their neighbours.
     """

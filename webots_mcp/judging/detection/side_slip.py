@@ -27,11 +27,8 @@ from webots_mcp.store.registered_signals import RegisteredSignal
 
 SLIP_S: Final = 3.0  # for so long
 SLIPS: Final = 0.5  # of the usual way per turn of the wheels
-CELLS_S: Final = (
-    0.25,
-    0.5,
-    1.0,
-)  # each twice the one before; over which speeds are compared; the noise chooses
+# Over which speeds are compared: each is twice the one before, and the noise chooses.
+CELLS_S: Final = (0.25, 0.5, 1.0)
 _CREEPS: Final = 0.2  # of how fast its wheels turn at their best: at less little can be said
 _LEAST_CELLS: Final = 6  # that tell a factor
 _DIFFERS: Final = 0.2  # of the faster side: by so much a curve shows in the wheels
@@ -172,7 +169,9 @@ def mean_speed(frame: Frame, wheels: Sequence[RegisteredSignal]) -> Array:
 
 def finite_rows(columns: tuple[Array, ...]) -> tuple[Array, ...]:
     """Return the rows in which all columns are finite."""
-    known = np.isfinite(sum(columns))
+    known = np.isfinite(columns[0])
+    for column in columns[1:]:
+        known &= np.isfinite(column)
     return columns if known.all() else tuple(each[known] for each in columns)
 
 

@@ -28,6 +28,7 @@ def kinds_of(*names: str) -> dict[str, Kind]:
         (("state.0", "state.1"), ("state.0", "state.1")),
         (("speed",), ("speed",)),
         (("a.", ".b"), ("a.", "b")),
+        (("gps.x", "state.gps.x", "mode"), ("gps.x", "state.gps.x", "mode")),
     ],
 )
 def test_what_is_left_of_names(names: tuple[str, ...], own: tuple[str, ...]) -> None:
@@ -52,6 +53,7 @@ def test_roles_and_meanings_are_those_without_the_key(key: str) -> None:
 def test_a_name_at_the_top_goes_before_the_same_one_below_a_key() -> None:
     roles = decide_roles(kinds_of("state.x_m", "state.y_m", "x_m", "y_m"))
     assert (roles["x_m"], roles["y_m"]) == ("x", "y")
+    assert (roles["state.x_m"], roles["state.y_m"]) == ("x2", "y2")
 
 
 @pytest.mark.parametrize("prefix", ["pose_", "robot_", "gps_", "filtered_", "body_"])

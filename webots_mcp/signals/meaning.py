@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from functools import lru_cache
 from itertools import pairwise
@@ -236,9 +237,16 @@ def own_names(names: Iterable[str]) -> dict[str, str]:
     """Return each of a robot's names without leading branches that say nothing of what it means.
 
     `state.gps.x` means what `gps.x` does, and where all that a robot publishes stands under one
-    key, such as its own name, that key says nothing. Times may stand next to it.
+    key, such as its own name, that key says nothing. Times may stand next to it. Names of which the
+    same would be left stay whole: `state.gps.x` next to `gps.x` is another signal.
     """
-    found = {name: _without_containers(name) for name in names}
+    found = _without_shared({name: _without_containers(name) for name in names})
+    often = Counter(found.values())
+    return {name: own if often[own] == 1 else name for name, own in found.items()}
+
+
+def _without_shared(found: dict[str, str]) -> dict[str, str]:
+    """Return names without the key below which all of them stand, if there is one."""
     tops = {
         own.partition(".")[0]
         for own in found.values()

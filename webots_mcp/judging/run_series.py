@@ -334,20 +334,34 @@ def _score_of(
     return Scored(found.value, found.why)
 
 
-def _rewards(
-    connection: sqlite3.Connection, run_ids: Sequence[int], is_published: bool
-) -> dict[int, Scored]:
-    """Return the rewards that bridges summed up, by run."""
-    of_all = {  # a controller that goes on after its last step leaves a second event
-        int(run_id): Scored(reward)
+def published_rewards(connection: sqlite3.Connection, run_ids: Sequence[int]) -> dict[int, float]:
+    """Return the rewards that bridges summed up, by run.
+
+    Args:
+        connection: Any.
+        run_ids: In ascending order; runs without a reward are not in the result.
+    """
+    if not run_ids:
+        return {}
+    wanted = set(run_ids)
+    return {  # a controller that goes on after its last step leaves a second event
+        int(run_id): float(reward)
         for run_id, reward in connection.execute(
             "SELECT run_id, total(json_extract(data, '$.reward')) FROM event WHERE kind = ? "
             "AND json_valid(data) AND json_type(data, '$.reward') IN ('integer', 'real') "
             "AND run_id BETWEEN ? AND ? GROUP BY run_id",
             (EPISODE_EVENT, run_ids[0], run_ids[-1]),
         )
+        if run_id in wanted
     }
-    if not any(run_id in of_all for run_id in run_ids):
+
+
+def _rewards(
+    connection: sqlite3.Connection, run_ids: Sequence[int], is_published: bool
+) -> dict[int, Scored]:
+    """Return the rewards as scores, by run."""
+    of_all = published_rewards(connection, run_ids)
+    if not of_all:
         raise InvalidInputError(
             "No run has a summed reward: bridges before this version did not sum it up, and "
             "neither do controllers without the bridge. Give another score, such as "
@@ -359,7 +373,7 @@ def _rewards(
     missing = Scored(
         None, "no summed reward: the run goes on, its controller was killed, or it published none"
     )
-    return {run_id: of_all.get(run_id, missing) for run_id in run_ids}
+    return {run_id: Scored(of_all[run_id]) if run_id in of_all else missing for run_id in run_ids}
 
 
 def _scored(

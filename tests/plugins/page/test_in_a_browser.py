@@ -115,6 +115,24 @@ def test_two_runs_lie_over_each_other_from_their_starts(
         tab.until(f"pose.0, run {run}", 1, 29)
 
 
+def test_the_list_of_runs_draws_each_and_opens_the_one_that_is_clicked(
+    opened: Callable[[Server], Tab], told: Server
+) -> None:
+    tab = opened(told)
+    tab.choose("robot", "rover")
+    tab.page.get_by_role("button", name="All runs").click()
+    tab.says("Curves: ")
+    rows = tab.page.locator("#run-rows tr")
+    expect(rows).to_have_count(3, timeout=PATIENCE_MS)
+    expect(rows.locator("path")).to_have_count(3, timeout=PATIENCE_MS)
+    rows.filter(has=tab.page.get_by_role("button", name="1", exact=True)).click()
+    tab.says("this is an earlier run; it ended by reset")
+    expect(tab.page.locator("#run-rows [aria-current]")).to_have_attribute("data-run", "1")
+    tab.page.get_by_role("button", name="All runs").click()
+    expect(rows.first).to_be_hidden()
+    assert tab.errors == []
+
+
 def test_a_zoom_reads_what_it_shows_and_the_address_brings_the_view_back(
     opened: Callable[[Server], Tab], told: Server
 ) -> None:

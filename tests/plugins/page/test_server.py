@@ -61,7 +61,7 @@ def test_each_ended_run_is_listed_with_the_outcome_of_its_check_in_words(told: S
     assert {number: ("passed", "failed")[code] for number, code in checked.items()} == shown
 
 
-@pytest.mark.parametrize("path", ["", "page.js", "look", "draw"])
+@pytest.mark.parametrize("path", ["", "page.js", "look", "draw", "runs"])
 def test_a_request_for_another_host_is_refused(told: Server, path: str) -> None:
     status, text = answer(told, path, Host=f"robots.example:{told.port}")
     assert status == 403

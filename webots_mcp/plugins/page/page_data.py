@@ -5,14 +5,11 @@ from __future__ import annotations
 import base64
 import io
 import json
-import logging
 import math
 import sqlite3
 import time
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from datetime import datetime
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
@@ -27,13 +24,14 @@ from webots_mcp.errors import (
     WebotsMCPError,
 )
 from webots_mcp.extras.requirements import quoted
-from webots_mcp.judging.checks.check_run import check_run
 from webots_mcp.plotting import changed_most
 from webots_mcp.plotting.interactive_svg import ROOM, signals_figure, way_figure
 from webots_mcp.plotting.signal_plot import SignalAxes, compose_signals
 from webots_mcp.plotting.trajectory import Obstacle, PlottedPath, TrajectoryAxes, compose_trajectory
 from webots_mcp.plugins.clip.make_clip import make_clip
 from webots_mcp.plugins.clip.moment import moment_at, newest_moment
+from webots_mcp.plugins.page.run_list import LIMITS as RUN_LIMITS
+from webots_mcp.plugins.page.run_list import listed_runs, run_choices
 from webots_mcp.plugins.report.controller_variables import shown_variables
 from webots_mcp.plugins.report.obstacles import obstacles_of, with_bodies
 from webots_mcp.signals.naming import flatten, spelled_out
@@ -57,7 +55,7 @@ from webots_mcp.store.run_rows import (
     newest_state,
     opened,
 )
-from webots_mcp.store.runs import RunInfo, list_runs
+from webots_mcp.store.runs import list_runs
 
 _LEVELS: Final = {"warning": "warning", "error": "error", "critical": "error"}
 
@@ -66,8 +64,6 @@ _LEVELS: Final = {"warning": "warning", "error": "error", "critical": "error"}
 class _PageLimits:
     """Limits of the data that the page shows."""
 
-    runs: int = 100
-    """Runs to choose from."""
     log_lines: int = 200
     """Lines of the log."""
     line_characters: int = 1000
@@ -78,10 +74,6 @@ class _PageLimits:
     """Characters of a text that is shown next to the name of its signal."""
     robots: int = 10
     """Robots on one map."""
-    checked_runs: int = 20
-    """Newest ended runs that are checked."""
-    check_s: float = 1.0
-    """Time limit of the check of one run."""
     settled_s: float = 5.0
     """Simulation time after which the signals that change are known."""
     picture_px: int = 640
@@ -93,14 +85,6 @@ class _PageLimits:
 _LIMITS: Final = _PageLimits()
 
 Axes = TypeVar("Axes", SignalAxes, TrajectoryAxes)
-
-_log: Final = logging.getLogger(__name__)
-_OUTCOMES: Final[dict[tuple[str, int, float], str]] = {}
-"""Outcomes of ended runs by database, run and start. The result of a check of them is final."""
-_CHECKING: Final = ThreadPoolExecutor(1, "webots-mcp outcomes")
-"""Checks runs in the background, so that no request waits for a check."""
-_NO_OUTCOME: Final = "not checked"
-"""Outcome of runs that were not checked yet, or cannot be checked."""
 
 
 @dataclass(frozen=True)
@@ -180,7 +164,7 @@ def robot_status(
         image = newest_image(connection, run.id) if run else None
         asked = LogFilter(run.id if run else None, LogWindow(-math.inf, math.inf),
                           robot_id=view.robot.id)  # fmt: skip
-        runs = list_runs(connection, robot=view.robot.name, limit=_LIMITS.runs).runs
+        runs = list_runs(connection, robot=view.robot.name, limit=RUN_LIMITS.runs).runs
         settable = steers and is_newest
         names = list(catalogue(connection, view.subject))[: _LIMITS.signal_names] if run else []
         return _status(header) | {
@@ -189,7 +173,7 @@ def robot_status(
             "started": run.started_wall_time_s if run else None,
             "until": header["sim_time_s"],
             "robots": [robot.name for robot in robots],
-            "runs": _with_outcomes(recording, runs),
+            "runs": run_choices(recording, runs),
             "names": names,
             "values": _newest_values(connection, run.id, names) if run else [],
             "lines": [_line(each) for each in newest_lines(connection, asked, _LIMITS.log_lines)],
@@ -300,45 +284,6 @@ def _first_steps(recording: RecordingAccess) -> list[dict[str, str]]:
     ]
 
 
-def run_title(run: RunInfo) -> str:
-    """Return a run in one line: its number, label, start and length."""
-    label = f" “{spelled_out(run.label)}”" if run.label else ""
-    began = datetime.fromtimestamp(run.started_wall_time_s).strftime("%d %b %H:%M:%S")
-    return f"run {run.run_id}{label} · {began} · {run.duration_s:.1f} s"
-
-
-def _with_outcomes(recording: RecordingAccess, runs: Sequence[RunInfo]) -> list[dict[str, Any]]:
-    """Return the runs to choose from; ended runs with the outcome of their check."""
-    choices: list[dict[str, Any]] = []
-    marked = 0
-    for run in runs:
-        outcome = ""
-        if run.end_reason and marked < _LIMITS.checked_runs:
-            marked += 1
-            key = (str(recording.database), run.run_id, run.started_wall_time_s)
-            if key not in _OUTCOMES:
-                _OUTCOMES[key] = _NO_OUTCOME
-                _CHECKING.submit(_check, recording, key)
-            outcome = _OUTCOMES[key]
-        title = " · ".join(filter(None, (run_title(run), outcome)))
-        choices.append({"id": run.run_id, "title": title, "outcome": outcome})
-    return choices
-
-
-def _check(recording: RecordingAccess, key: tuple[str, int, float]) -> None:
-    """Check a run. A run that cannot be read now is checked with a later request."""
-    try:
-        with recording.reader() as connection:
-            outcome = check_run(connection, key[1], deadline_s=_LIMITS.check_s).outcome
-        _OUTCOMES[key] = {"fail": "failed", "warn": "warned", "pass": "passed"}.get(
-            outcome, _NO_OUTCOME
-        )
-    except (WebotsMCPError, sqlite3.Error):
-        del _OUTCOMES[key]
-    except Exception:  # noqa: BLE001 - No request waits for it and could report it.
-        _log.exception("run %d cannot be judged", key[1])
-
-
 def _line(line: LogLine) -> dict[str, Any]:
     at = "" if line.sim_time_s is None else f"{line.sim_time_s:.3f} s"
     message = spelled_out(line.message[: _LIMITS.line_characters])
@@ -408,6 +353,13 @@ def film(recording: RecordingAccess, request: PageRequest) -> dict[str, Any]:
     caption = f"{content.view}, {content.start_s:.3f} to {content.end_s:.3f} s{what}"
     data = base64.b64encode(clip.data).decode("ascii")
     return {"uri": f"data:image/webp;base64,{data}", "caption": spelled_out(caption)}
+
+
+def all_runs(recording: RecordingAccess, request: PageRequest) -> dict[str, Any]:
+    """Return the newest runs of a robot, with a small curve of the first named signal of each."""
+    with recording.reader() as connection:
+        robot = _view(connection, request).robot
+        return listed_runs(recording, connection, robot, (request.names or ("",))[0])
 
 
 def _inspected(connection: sqlite3.Connection, run_id: int) -> list[float]:

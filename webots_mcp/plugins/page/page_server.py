@@ -25,6 +25,7 @@ from urllib.parse import parse_qsl
 from webots_mcp.errors import InvalidInputError, WebotsMCPError
 from webots_mcp.plotting.interactive_svg import figure_part
 from webots_mcp.plugins.page.page_data import (
+    all_runs,
     controller_variables,
     describe_signals,
     draw,
@@ -414,6 +415,10 @@ def _answer_variables(server: PageServer, asked: dict[str, str]) -> dict[str, An
     return controller_variables(server.recording, page_request(asked))
 
 
+def _answer_runs(server: PageServer, asked: dict[str, str]) -> dict[str, Any]:
+    return all_runs(server.recording, page_request(asked))
+
+
 def _steer(server: PageServer, asked: dict[str, str], body: dict[str, Any]) -> dict[str, Any]:
     robot = asked.get("robot", "")
     if body.get("order") in ORDERS:
@@ -434,6 +439,7 @@ _QUESTIONS: Final = {
     "film": _answer_film,
     "signals": _answer_signals,
     "variables": _answer_variables,
+    "runs": _answer_runs,
 }
 
 

@@ -9,6 +9,7 @@ const DRAGGED = "application/x-webots-mcp-signal";
 const INSPECTED_NEAR_S = 0.5; // from the cursor: its variables are shown
 const INSPECTED_LATELY_S = 5; // before the newest row, where there is no cursor
 const SNAP_PX = 8; // a click so near to an event means the event
+const RUNS_MS = 5000; // after which the curves of runs that go on, or could not be read in time, are read again
 const FEW_SIGNALS = 40; // so many are shown without a click on their branch
 const figures = { signals: by("signal-figure"), way: by("way-figure") };
 
@@ -19,7 +20,7 @@ const wanted = {
   robot: asked.get("robot"), run: asked.get("run"), beside: asked.get("beside"),
   window: asked.get("window") ?? "60", signals: JSON.parse(asked.get("signals") ?? "null"),
   panels: JSON.parse(asked.get("panels") ?? "null"), view: JSON.parse(asked.get("view") ?? "null"),
-  all: asked.get("all"), at: asked.get("at"),
+  all: asked.get("all"), at: asked.get("at"), list: asked.get("list"),
 };
 let shown = null; // the newest look
 let names = []; // the signals of the robot
@@ -101,6 +102,7 @@ function show(answer) {
   hide(by("robots"), answer.robots.length < 2);
   hide(by("run").parentElement, answer.runs.length === 0);
   hide(by("beside").parentElement, answer.runs.length < 2);
+  hide(by("list"), answer.runs.length < 2);
   offer("robot", answer.robots.map((name) => [name, name]), answer.robot);
   const runs = answer.runs.map(({ id, title }) => [String(id), title]);
   offer("run", [["", "newest run"], ...runs], wanted.run ?? "");
@@ -116,6 +118,7 @@ function show(answer) {
   showVariables();
   if (answer.picture !== lastPicture) showPicture(answer.picture);
   showOrders(answer.orders, answer.pace, answer.why_off);
+  listRuns();
   showOutcome(answer.runs.find(({ id }) => id === answer.run)?.outcome ?? "");
 }
 
@@ -178,6 +181,75 @@ function markLog() {
   before?.classList.remove("at-cursor");
   marked?.classList.add("at-cursor");
   if (marked) by("log").scrollTop = marked.offsetTop - by("log").offsetTop - by("log").clientHeight + marked.offsetHeight;
+}
+
+let runsOf = ""; // what the list of runs shows: robot, runs with their outcomes, and the signal
+let isReadingRuns = false;
+let runsReadAt = -Infinity;
+let areAllRead = true;
+
+/** Show all runs, while their list is open: each with a small curve of the first signal that is drawn. */
+async function listRuns() {
+  const isOpen = Boolean(wanted.list) && shown.runs.length > 1;
+  hide(by("runs"), !isOpen);
+  by("list").ariaExpanded = String(isOpen);
+  if (!isOpen || isReadingRuns) return;
+  const signal = (wanted.signals ?? drawnNames)[0] ?? "";
+  const key = JSON.stringify([shown.robot, shown.runs, signal]);
+  const isDue = (shown.live || !areAllRead) && performance.now() - runsReadAt > RUNS_MS;
+  if (key === runsOf && !isDue) return markRun();
+  isReadingRuns = true;
+  try {
+    const answer = await ask("runs", { robot: shown.robot, signals: JSON.stringify(signal ? [signal] : null) });
+    runsReadAt = performance.now();
+    if (answer.rows) {
+      areAllRead = answer.is_whole;
+      runsOf = areAllRead || !answer.has_more ? key : ""; // as long as each answer brings more, go on at once
+      showRuns(answer);
+    }
+  } catch { // The next look reports why, and asks again.
+    runsOf = "";
+  }
+  isReadingRuns = false;
+}
+
+function showRuns({ rows, total, signal, low, high, longest_s, has_rewards }) {
+  by("runs").classList.toggle("no-reward", !has_rewards);
+  by("runs").classList.toggle("no-curve", !signal);
+  by("runs-signal").textContent = signal;
+  const figure = (value) => String(Number(value.toPrecision(4)));
+  const axes = signal && `Curves: ${signal} over the first ${figure(longest_s)} s of each run, all from ${figure(low)} (bottom) to ${figure(high)} (top).`;
+  by("runs-say").textContent = `${total > rows.length ? `The newest ${rows.length} of ${total}` : total} runs, newest first. ${axes}`;
+  const focused = document.activeElement?.closest("#run-rows tr")?.dataset.run;
+  by("run-rows").replaceChildren(...rows.map((run) => {
+    const button = element("button", { textContent: run.label ? `${run.id} “${run.label}”` : run.id, title: "Show this run" });
+    const text = (textContent, className = "") => element("td", { textContent, className });
+    const row = element("tr", {}, element("td", {}, button), text(run.began), text(run.length), text(run.ended),
+      text(run.outcome), text(run.reward === null ? "" : figure(run.reward), "reward"), element("td", {}, smallCurve(run.curve)));
+    row.dataset.run = run.id;
+    row.addEventListener("click", () => { by("run").value = run.id; change({ run: String(run.id), view: null, at: null }); });
+    return row;
+  }));
+  by("run-rows").querySelector(`[data-run="${focused}"] button`)?.focus();
+  markRun();
+}
+
+/** A curve without axes, of points that are shares of its width and height; null is a gap. */
+function smallCurve(points) {
+  const figure = document.createElementNS(SVG, "svg");
+  figure.setAttribute("viewBox", "0 -0.05 1 1.1");
+  figure.setAttribute("preserveAspectRatio", "none");
+  figure.setAttribute("aria-hidden", "true");
+  const steps = points.map(([x, y], at) => (y === null ? "" : `${at && points[at - 1][1] !== null ? "L" : "M"}${x} ${1 - y}`));
+  if (points.length) made("path", { d: steps.join("") }, figure);
+  return figure;
+}
+
+function markRun() {
+  for (const row of by("run-rows").children) {
+    if (Number(row.dataset.run) === shown.run) row.ariaCurrent = "true";
+    else row.removeAttribute("aria-current");
+  }
 }
 
 let variablesOf = ""; // the inspection that is shown: its robot, run and time
@@ -465,6 +537,7 @@ by("all-robots").checked = Boolean(wanted.all);
 by("robot").addEventListener("change", (event) => change({ robot: event.target.value, run: null, beside: null, signals: null, panels: null, view: null, at: null }));
 by("run").addEventListener("change", (event) => change({ run: event.target.value || null, view: null, at: null }));
 by("beside").addEventListener("change", (event) => change({ beside: event.target.value || null, view: null }));
+by("list").addEventListener("click", () => { change({ list: wanted.list ? null : "1" }); if (shown) listRuns(); });
 by("window").addEventListener("change", (event) => change({ window: event.target.value, view: null }));
 by("all-robots").addEventListener("change", (event) => change({ all: event.target.checked ? "1" : null }));
 by("find").addEventListener("input", listSignals);

@@ -73,6 +73,7 @@ def test_every_part_stands_on_a_floor_and_the_picture_in_contributing_is_this_on
     ]
 
 
+@pytest.mark.slow
 def test_each_file_imports_only_parts_that_stand_below_its_own() -> None:
     upwards = {
         f"{file.relative_to(PACKAGE)} imports {part}"

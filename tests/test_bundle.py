@@ -130,6 +130,7 @@ def unpacked(tmp_path: Path) -> Path:
     return tmp_path / "unpacked"
 
 
+@pytest.mark.slow
 def test_the_manifest_of_the_bundle_is_valid_and_of_this_version(unpacked: Path) -> None:
     import jsonschema  # it takes a second, of one process
 
@@ -144,6 +145,7 @@ def test_the_manifest_of_the_bundle_is_valid_and_of_this_version(unpacked: Path)
         jsonschema.validate({**manifest, "icon": 1}, MANIFEST)
 
 
+@pytest.mark.slow
 def test_the_bundle_installs_the_wheel_that_is_in_it_and_starts_the_server(
     unpacked: Path, tmp_path: Path
 ) -> None:

@@ -36,6 +36,7 @@ def steps(file: Path) -> Iterator[dict[str, Any]]:
         yield from job.get("steps", ())
 
 
+@pytest.mark.slow
 def test_the_workflows_are_valid_by_the_schema_of_the_host() -> None:
     pytest.importorskip("check_jsonschema", reason="check-jsonschema is not installed")
     line = [sys.executable, "-m", "check_jsonschema", "--builtin-schema", "vendor.github-workflows"]

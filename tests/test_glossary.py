@@ -8,6 +8,8 @@ import tokenize
 from collections.abc import Iterator
 from pathlib import Path
 
+import pytest
+
 _ROOT = Path(__file__).parents[1]
 _CONTRIBUTING = (_ROOT / "CONTRIBUTING.md").read_text("utf-8")
 _GLOSSARY = _CONTRIBUTING.partition("## Glossary")[2].partition("\n## ")[0]
@@ -55,6 +57,7 @@ def test_words_without_a_technical_meaning_are_in_no_plain_package() -> None:
             assert not _WITHOUT_MEANING.findall(module.read_text("utf-8")), module
 
 
+@pytest.mark.slow
 def test_private_words_are_in_no_comment_or_docstring() -> None:
     assert _PRIVATE.search("# the least of so many rows")
     for folder in _REWRITTEN:

@@ -6,7 +6,11 @@ import ast
 from collections import defaultdict
 from pathlib import Path
 
+import pytest
+
 import webots_mcp
+
+pytestmark = pytest.mark.slow
 
 PACKAGE = Path(webots_mcp.__file__).parent
 ONCE = ("Place", "Run", "Kind", "Progress", "Report", "Frame")

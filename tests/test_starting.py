@@ -6,6 +6,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 from tests.recordings.rows import Recorded, insert
 from webots_mcp.cli.commands import COMMANDS, EVERYDAY
 from webots_mcp.cli.question_commands import command_of
@@ -110,6 +112,7 @@ def test_they_are_listed_with_the_sentences_of_their_own_help() -> None:
         assert (function.__doc__ or "").strip().splitlines()[0] == sentence, name
 
 
+@pytest.mark.slow
 def test_status_waits_for_no_tool_but_its_own(tmp_path: Path) -> None:
     recording = Recorded(tmp_path / "webots.db")
     robot = recording.robot()
@@ -123,6 +126,7 @@ def test_status_waits_for_no_tool_but_its_own(tmp_path: Path) -> None:
     assert not {"webots_mcp.steering", "webots_mcp.simulator", "webots_mcp.plotting"} & loaded
 
 
+@pytest.mark.slow
 def test_a_server_lists_its_tools_without_what_carries_them_out(tmp_path: Path) -> None:
     program = f"""
 import anyio

@@ -68,6 +68,7 @@ def test_lost_rows_come_back_unless_too_many_are_lost_in_a_row(lost: set[int]) -
         np.testing.assert_allclose(found, times)
 
 
+@pytest.mark.slow
 @given(st.lists(st.floats(0.02, 0.029), min_size=50, max_size=200))
 def test_rows_that_come_unevenly_stay_as_they_are(intervals: list[float]) -> None:
     times = np.cumsum(intervals)

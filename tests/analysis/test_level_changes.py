@@ -16,6 +16,7 @@ def test_changes_are_found_where_they_are() -> None:
     assert abs(places[0] - 40) <= 1 and abs(places[1] - 80) <= 1
 
 
+@pytest.mark.slow
 def test_one_level_is_hardly_ever_divided() -> None:
     draws = np.random.default_rng(2)
     divided = sum(bool(level_changes(draws.lognormal(0, 1, 60), 1e-3)) for _ in range(3000))

@@ -44,6 +44,7 @@ def test_the_shortest_tracks_are_tracks(rows: int) -> None:
     assert path_length(track).length_m == max(0, rows - 1)
 
 
+@pytest.mark.slow
 @given(st.integers(0, 50), st.floats(-100, 100), st.floats(-100, 100), st.floats(0, 6.28))
 def test_the_length_of_a_way_hangs_neither_on_where_nor_on_whither(
     seed: int, east_m: float, north_m: float, angle: float

@@ -86,6 +86,7 @@ def rates(runs: int, effect_sd: float) -> dict[bool | None, int]:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("runs", [(8, 2), (7, 3), (10, 4)])
 @pytest.mark.parametrize("scatter", [0.0, 0.3])
 def test_a_few_runs_that_scatter_do_not_differ_from_many_that_do_not(

@@ -71,6 +71,7 @@ def test_who_creeps_stands_once_and_only_while_it_rests(
     assert told_s == pytest.approx(ends_s, abs=10)
 
 
+@pytest.mark.slow
 def test_who_creeps_for_an_hour_stands_where_it_rests_and_is_not_searched_beyond_its_time() -> None:
     creeps, short = (1800.0, 0.01, 0.0), (8.0, 0.0, 0.0)
     track, _ = noisy_track([creeps, RESTS, creeps, short, creeps], 0.1, 0.004)
@@ -95,6 +96,7 @@ def test_who_twitches_in_a_place_stands_once(twitches_m: list[float], noise_m: f
     assert told_s == pytest.approx(ends_s, abs=0.25)
 
 
+@pytest.mark.slow
 def test_few_rows_with_long_gaps_between_them_are_judged_by_rows_alone() -> None:
     random = np.random.default_rng(0)
     for _ in range(300):

@@ -24,6 +24,7 @@ json_values = st.recursive(
 )
 
 
+@pytest.mark.slow
 @settings(max_examples=50)
 @given(json_values, st.integers(min_value=40, max_value=1250))
 def test_whatever_was_published_fits_its_budget(value: Any, budget_tokens: int) -> None:
@@ -54,6 +55,7 @@ def test_what_fits_in_words_does_not_fit_in_numbers() -> None:
     assert shorten(numbers, 120, WHOLE).rule is not None
 
 
+@pytest.mark.slow
 @settings(max_examples=50)
 @given(json_values)
 def test_what_was_left_out_is_said_and_what_fits_is_unchanged(value: Any) -> None:

@@ -264,6 +264,7 @@ VALUES: st.SearchStrategy[Any] = st.recursive(
 )
 
 
+@pytest.mark.slow
 @settings(deadline=None)
 @given(st.dictionaries(KEYS, VALUES, max_size=5), st.booleans())
 def test_whatever_is_published_sqlite_can_read_it_and_it_is_bounded_and_what_is_odd_is_named(
@@ -294,6 +295,7 @@ PARTS: st.SearchStrategy[Any] = st.recursive(
 )
 
 
+@pytest.mark.slow
 @settings(deadline=None)
 @given(
     st.lists(st.dictionaries(st.sampled_from(["a", "b", "a.b", 0]), PARTS), max_size=6),

@@ -147,6 +147,7 @@ def test_a_reset_begins_without_frames_of_the_run_before(
     assert len(rows) == pytest.approx(100 * STEP_S / INTERVAL_S, abs=2)
 
 
+@pytest.mark.slow
 def test_memory_holds_a_bounded_number_of_frames(
     robot: InProcessSupervisor, make: Make, camera: Any, recording: Recording
 ) -> None:

@@ -74,6 +74,7 @@ def test_a_declaration_made_while_the_database_is_locked_comes_in_later(
         ]
 
 
+@pytest.mark.slow
 def test_what_waits_when_the_controller_ends_is_taken_in_by_the_next_process(
     robot: InProcessSupervisor, file: Path, filed: Recording
 ) -> None:

@@ -311,6 +311,7 @@ def test_what_the_world_needs_is_not_removed(scene: Scene, path: str, said: str)
     assert not scene.events("remove_node")
 
 
+@pytest.mark.slow
 def test_more_changes_than_are_remembered_are_said_to_stay(scene: Scene) -> None:
     sent = [
         scene.recording.send("set_field", path="BALL.name", value=f"ball {i}") for i in range(3)

@@ -155,6 +155,7 @@ def test_the_name_of_a_node_is_shown_once(crowd: Scene) -> None:
     assert all(len(row) == len(shown["columns"]) for row in shown["rows"])
 
 
+@pytest.mark.slow
 def test_a_scene_that_is_too_large_is_given_in_parts(crowd: Scene) -> None:
     for i in range(60):
         crowd.ask("add_node", vrml=f'DEF PIECE_{i:02} Solid {{ name "the piece number {i}" }}')

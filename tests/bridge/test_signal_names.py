@@ -59,6 +59,7 @@ def test_a_number_is_a_mode_while_it_is_whole(bridge: MCPBridge, recording: Reco
     assert recording.rows("SELECT mode FROM robot_now") == [None]
 
 
+@pytest.mark.slow
 def test_many_names_are_entered_some_with_each_row_and_never_too_many(
     bridge: MCPBridge, recording: Recording
 ) -> None:

@@ -49,6 +49,7 @@ def test_the_shape_of_a_plain_state_is_learned_at_once() -> None:
     assert known({"x": {1, 2}})._last.shape is None  # pyright: ignore[reportPrivateUsage]
 
 
+@pytest.mark.slow
 @given(st.lists(STATES, min_size=1, max_size=4))
 def test_states_of_any_shapes_are_encoded_as_alone(states: list[dict[str, Any]]) -> None:
     encoder = StateEncoder()
@@ -67,6 +68,7 @@ def test_other_values_at_known_keys_are_checked_as_alone(values: list[Any]) -> N
     assert encoder.encode(state) == encode(copy.deepcopy(state))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("make", MONSTERS.values(), ids=MONSTERS)
 def test_an_object_of_the_users_own_is_never_taken_for_a_known_state(make: Any) -> None:
     shape = shape_of(PLAIN)

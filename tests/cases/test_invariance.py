@@ -29,6 +29,8 @@ from tests.cases.situations import (
 from tests.memory import memory_connection
 from webots_mcp.store.reading.segment import one_reading
 
+pytestmark = pytest.mark.slow
+
 _MODULES = (healthy_robots, problems)  # which fill the registries
 SITUATIONS: Final = PROBLEMS | HEALTHY | PUBLIC
 _ABOUT_DROPOUTS: Final = frozenset(("gap", "missing", "run", "log", "change"))

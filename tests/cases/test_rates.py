@@ -8,6 +8,8 @@ import pytest
 
 from tests.cases.rates import FAULTS, INTERVALS_S, NOISES, NOT_SEARCHED, RIGHT, answer
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.mark.parametrize("name", FAULTS)
 def test_it_is_found_at_every_rate_and_noise_or_said_not_to_be_searchable(name: str) -> None:

@@ -20,6 +20,7 @@ _REGISTERED = more_unfamiliar
 _NOT_JUDGED = {"tracked excavator": "speeds of tracks are not known to be those of wheels"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("interval_s", INTERVALS_S[1:])  # the module asks at all of them
 @pytest.mark.parametrize("name", ROBOTS)
 def test_a_healthy_robot_raises_no_alarm(name: str, interval_s: float) -> None:

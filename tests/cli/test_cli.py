@@ -264,6 +264,7 @@ def test_an_argument_too_many_is_named(capsys: pytest.CaptureFixture[str]) -> No
     assert "status takes no further argument: 'head' 'now'" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_the_server_keeps_stdout_for_the_protocol(tmp_path: Path) -> None:
     with run("serve", "--data-dir", str(tmp_path)) as process:
         out, err = process.communicate("", timeout=60)

@@ -11,6 +11,7 @@ from tests.older_recording import make_older
 from webots_mcp.cli import main
 
 
+@pytest.mark.slow
 def test_what_is_well_ends_with_0_and_a_line_for_each_check(
     bridge_recording: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

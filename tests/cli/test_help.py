@@ -34,10 +34,12 @@ def messages() -> Iterator[tuple[str, str]]:
             yield file.name, file.read_text("utf-8")
 
 
+@pytest.mark.slow
 def test_no_message_names_a_page_as_a_file() -> None:
     assert [place for place, text in messages() if re.search(r"\bdocs/[\w-]+\.md", text)] == []
 
 
+@pytest.mark.slow
 def test_each_topic_that_a_message_names_is_a_page_or_a_heading_of_it() -> None:
     named = {topic for _, text in messages() for topic in NAMED_TOPIC.findall(text)}
     assert {"standin", "policy", "pool"} <= named
@@ -121,6 +123,7 @@ def test_all_links_between_pages_lead_to_a_section() -> None:
             assert sections_about(wanted)[0].topic == " ".join(wanted), file
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no pseudo-terminals")
 def test_a_terminal_shows_it_rendered_and_a_pipe_gets_its_text() -> None:
     import pty

@@ -15,6 +15,8 @@ import pytest
 from tests import unprivileged
 from webots_mcp.contract import bundled
 
+pytestmark = pytest.mark.slow
+
 CONTROLLER = "from controller import Robot\n\nrobot = Robot()\nwhile robot.step(32) != -1: pass\n"
 WRITTEN = [
     ".mcp.json", ".cursor/mcp.json", ".vscode/mcp.json", "mcp_data/.gitignore", "webots-mcp.toml",

@@ -107,6 +107,7 @@ def test_it_says_who_records_and_leaves_nothing_running_however_it_ends(
         assert "Traceback" not in out + rest
 
 
+@pytest.mark.slow
 def test_webots_ends_by_itself_with_its_own_exit_code(
     launch: Launch, project: Callable[..., Path]
 ) -> None:
@@ -118,6 +119,7 @@ def test_webots_ends_by_itself_with_its_own_exit_code(
     assert "ending Webots" not in said
 
 
+@pytest.mark.slow
 def test_a_port_that_is_taken_is_told_by_the_one_that_webots_took(
     launch: Launch, project: Callable[..., Path]
 ) -> None:
@@ -143,6 +145,7 @@ def test_it_says_why_nobody_records(
     _assert_told(launch, project(controller), text=said)
 
 
+@pytest.mark.slow
 def test_an_extern_controller_that_is_missing_is_named(
     launch: Launch, project: Callable[..., Path]
 ) -> None:
@@ -153,6 +156,7 @@ def test_an_extern_controller_that_is_missing_is_named(
     _assert_told(launch, world, text=said)
 
 
+@pytest.mark.slow
 def test_webots_that_ends_at_its_start_is_told_with_what_it_said(
     launch: Launch, project: Callable[..., Path]
 ) -> None:
@@ -168,6 +172,7 @@ def test_webots_that_ends_at_its_start_is_told_with_what_it_said(
     assert told.count("a world begins with") == 1
 
 
+@pytest.mark.slow
 def test_without_a_free_port_webots_says_so_and_ends(
     launch: Launch, project: Callable[..., Path]
 ) -> None:
@@ -217,6 +222,7 @@ def test_a_folder_where_nothing_can_be_recorded_is_told_before_webots_runs(
     assert "mcp_data" in _refusal(capsys, world)
 
 
+@pytest.mark.slow
 def test_who_reads_no_longer_ends_it(launch: Launch, project: Callable[..., Path]) -> None:
     process = launch(project(CONTROLLER + '    print("x" * 9999)\n'), "--mode", "fast")
     _told(process, "records")
@@ -225,6 +231,7 @@ def test_who_reads_no_longer_ends_it(launch: Launch, project: Callable[..., Path
     assert process.wait(60) == 0
 
 
+@pytest.mark.slow
 def test_what_webots_says_is_recorded_also_where_no_controller_ever_recorded(
     launch: Launch,
     project: Callable[..., Path],
@@ -243,6 +250,7 @@ def test_what_webots_says_is_recorded_also_where_no_controller_ever_recorded(
     wait_for(lambda: "console: ValueError: no arm" in told())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_the_stand_in_runs_a_world_where_no_webots_is(
     launch: Launch, project: Callable[..., Path], number: signal.Signals, tmp_path: Path
@@ -265,6 +273,7 @@ def test_the_stand_in_says_why_no_controller_records(
     assert "(attach one: webots-mcp init --patch " in _told(process, "no controller has recorded")
 
 
+@pytest.mark.slow
 def test_the_stand_in_runs_a_file_for_an_extern_robot(
     launch: Launch, project: Callable[..., Path], tmp_path: Path
 ) -> None:

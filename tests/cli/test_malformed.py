@@ -28,6 +28,7 @@ ASKED = (
 )  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("damage", DAMAGES, ids=str)
 def test_every_question_is_answered_past_a_wrong_value(tmp_path: Path, damage: Damage) -> None:
     file = tmp_path / "webots.db"

@@ -10,6 +10,8 @@ import pytest
 from tests.cli.test_init_command import project, run, snapshot
 from webots_mcp.standin.in_process import DEFAULT_WORLD
 
+pytestmark = pytest.mark.slow
+
 __all__ = ["project"]
 
 WORLD = "worlds/arena.wbt"

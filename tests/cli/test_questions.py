@@ -205,6 +205,7 @@ def test_a_person_is_told_of_no_server_and_no_resource(tmp_path: Path, cli: Cli)
     assert "'.schema' in the sqlite3 shell" in described()["sql"].text
 
 
+@pytest.mark.slow
 def test_examples_can_be_typed() -> None:
     typed = [
         line.strip()
@@ -260,6 +261,7 @@ def test_each_command_that_stands_for_a_tool_exists() -> None:
     assert {command.partition(" ")[0] for command in commands.values()} <= {*names()}
 
 
+@pytest.mark.slow
 def test_questions_load_neither_the_server_nor_what_draws(story: Path) -> None:
     program = (
         "import sys\nfrom webots_mcp.cli import main\n"

@@ -59,6 +59,7 @@ def query(database: Path, sql: str) -> list[Any]:
 # -- export ---------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_export_writes_csv_to_a_pipe(database: Path) -> None:
     line = [sys.executable, "-m", "webots_mcp", "export", "--database", str(database), "--run", "1"]
     done = subprocess.run(line, capture_output=True, text=True, timeout=60, check=True)
@@ -320,6 +321,7 @@ def test_without_a_recording_each_says_so(
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_progress_is_shown_on_a_terminal_and_vanishes(database: Path) -> None:
     pty = pytest.importorskip("pty", reason="terminals like these are of Unix")
     parent, child = pty.openpty()

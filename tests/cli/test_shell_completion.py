@@ -141,6 +141,7 @@ def test_zsh_and_fish_complete_recorded_names(
     assert offered in ended.stdout.split(), (ended.stdout, ended.stderr)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shell", ["zsh", "fish", "powershell"])
 def test_each_shell_has_a_script_that_knows_every_command(
     shell: str, capsys: pytest.CaptureFixture[str]

@@ -35,6 +35,7 @@ def tunable(tmp_path: Path) -> Iterator[TunableDriver]:
     driving.stop()
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("driver")
 def test_a_run_says_why_it_stopped_and_what_happened(cli: Cli) -> None:
     said = cli("run --for 0.48 --reset --until 'steps < 0'")
@@ -46,6 +47,7 @@ def test_a_run_says_why_it_stopped_and_what_happened(cli: Cli) -> None:
     assert ran["advanced_s"] == pytest.approx(0.16)
 
 
+@pytest.mark.slow
 def test_send_pause_step_resume_and_keep(cli: Cli, driver: Driver, recording: Recording) -> None:
     assert "speed 3.5" in cli("send set_speed speed=3.5 --timeout 3600")
     assert driver.speed == 3.5
@@ -88,6 +90,7 @@ def test_what_makes_no_sense_is_refused(
     assert words in cli.refused(typed)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("driver")
 def test_a_run_that_takes_longer_is_waited_for_or_ended_with_the_lines_that_it_names(
     recording: Recording, cli: Cli
@@ -120,6 +123,7 @@ def test_breakpoints_are_set_listed_hit_and_removed(recording: Recording, cli: C
     assert "breakpoint_id 1, armed false" in cli("breakpoint --remove 1")
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("driver")
 @pytest.mark.parametrize(
     ("typed", "number", "why"),
@@ -154,6 +158,7 @@ def test_the_scene_is_a_table(cli: Cli) -> None:
     assert rows == [[1, "ROVER", "Robot", "rover"]]
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("driver")
 def test_a_field_is_shown_and_set(cli: Cli) -> None:
     assert "value 0.05" in cli("field BALL.physics.mass")

@@ -68,6 +68,7 @@ def test_the_permissions_stop_the_process_of_these_tests(artifact: Path) -> None
     assert "PermissionError" in ended.stderr
 
 
+@pytest.mark.slow
 def test_every_command_that_reads_reads_it_and_says_how(artifact: Path, tmp_path: Path) -> None:
     commands = [
         ["status"],
@@ -89,6 +90,7 @@ def test_every_command_that_reads_reads_it_and_says_how(artifact: Path, tmp_path
     assert (tmp_path / "x.csv").read_text().count("\n") == 51
 
 
+@pytest.mark.slow
 async def test_what_waits_beside_it_is_said_not_to_be_in_it(recorded: Recorded) -> None:
     """Rows of a bridge that was killed, and the journal of a controller in C."""
     assert isinstance(recorded.database, Path)
@@ -105,6 +107,7 @@ async def test_what_waits_beside_it_is_said_not_to_be_in_it(recorded: Recorded) 
         assert "without the rows in 2 waiting files" in said
 
 
+@pytest.mark.slow
 async def test_a_read_only_server_answers_from_it_and_says_how(artifact: Path) -> None:
     async with Client(serve(artifact, "--read-only")) as client:
         for tool, arguments in (
@@ -120,6 +123,7 @@ async def test_a_read_only_server_answers_from_it_and_says_how(artifact: Path) -
         assert answer["result"]["rows"] == [[51]]
 
 
+@pytest.mark.slow
 async def test_a_server_that_wants_to_write_to_it_names_the_one_that_does_not(
     artifact: Path,
 ) -> None:

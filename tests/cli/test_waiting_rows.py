@@ -52,6 +52,7 @@ def test_an_export_has_the_rows_that_waited(
     assert "are not in this answer" not in "".join(capsys.readouterr())
 
 
+@pytest.mark.slow
 def test_an_export_of_a_locked_database_says_how_many_rows_it_lacks(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

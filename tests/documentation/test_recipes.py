@@ -91,6 +91,7 @@ def in_shell(code: str, folder: Path) -> str:
     return run(["sh", "-c", code.replace(name, f"'{program(name)}'", 1)], folder)
 
 
+@pytest.mark.slow
 def test_the_sqlite3_shell_shows_where_each_robot_is(project: Path) -> None:
     now, lines = blocks("sqlite3", "sh")
     answer = in_shell(now, project)
@@ -144,6 +145,7 @@ def duckdb_extension() -> None:
     pytest.skip("DuckDB's SQLite extension is not installed and cannot be fetched")
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("duckdb_extension")
 def test_duckdb_reads_the_states(project: Path) -> None:
     [code] = blocks("DuckDB", "python")

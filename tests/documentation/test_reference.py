@@ -61,6 +61,7 @@ def test_each_tool_has_its_parameters_with_their_meaning() -> None:
         assert all(meaning for _, meaning in rows), tool.name
 
 
+@pytest.mark.slow
 def test_each_command_has_its_options() -> None:
     shown = parts(reference.commands())
     assert sorted(shown) == names()

@@ -49,6 +49,7 @@ def right_answer(scenario: Scenario) -> dict[str, Any]:
 # -- the scenarios ---------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scenario", SCENARIOS, ids=lambda each: each.name)
 def test_the_planned_client_answers_rightly_without_a_wrong_turn(scenario: Scenario) -> None:
     outcome = ask(scenario, answer_by_plan)
@@ -98,6 +99,7 @@ def cheated() -> dict[str, list[Outcome]]:
     return dict(zip(clients, (list(each) for each in zip(*asked, strict=True)), strict=True))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CHEATS)
 def test_a_cheat_scores_under_ten_percent_even_if_it_had_called(
     name: str, cheated: dict[str, list[Outcome]]
@@ -244,6 +246,7 @@ def typed(*words: str) -> str:
     return shlex.join(["env", f"PYTHONPATH={CHECKOUT}", sys.executable, *words])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("client", "called", "wrong"),
     [
@@ -269,6 +272,7 @@ def test_a_client_of_the_command_line_is_judged_by_its_calls_and_its_answer(
     assert all(call.tokens > 50 and not call.failed for call in outcome.calls)
 
 
+@pytest.mark.slow
 def test_a_failed_call_of_a_command_line_client_is_noted(tmp_path: Path) -> None:
     script = tmp_path / "client.py"
     script.write_text(
@@ -325,6 +329,7 @@ def test_the_sign_test_gives_the_probability_of_chance(
     assert sign_test(gained, lost) == pytest.approx(chance)
 
 
+@pytest.mark.slow
 def test_the_command_prints_scores_saves_them_and_compares(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -45,6 +45,7 @@ def is_answered(answer: Any) -> bool:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", RECORDINGS)
 def test_every_answer_is_the_accepted_one(name: str) -> None:
     found = difference(name, asked(name)[1])

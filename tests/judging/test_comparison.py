@@ -286,6 +286,7 @@ def test_a_run_that_never_reached_its_goal_is_not_better_for_having_been_shorter
     assert "8 (after 7.9 s)" in note and "x > 3" in note
 
 
+@pytest.mark.slow
 def test_hundreds_of_short_runs_are_compared_with_few_statements_each(
     empty: sqlite3.Connection,
 ) -> None:

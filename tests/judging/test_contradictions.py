@@ -30,6 +30,8 @@ from webots_mcp.judging.verdicts import Outcome
 from webots_mcp.store.reading.ranges import Scope, find_range
 from webots_mcp.store.reading.segment import one_reading
 
+pytestmark = pytest.mark.slow
+
 _MODULES = (healthy_robots, problems)  # which fill the registries
 _EXAMPLES = attempts(8, exploring=200)
 _UNHURRIED_S: Final = 300.0

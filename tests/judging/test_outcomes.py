@@ -128,6 +128,7 @@ def test_a_run_without_a_mode_was_in_no_mode_for_no_known_time(empty: sqlite3.Co
     assert found.unknown["share of each mode"].startswith("run 2: no mode is known")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("runs", "different", "wanted"), [(2, None, 7), (5, None, 7), (7, True, None)]
 )

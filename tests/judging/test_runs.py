@@ -147,6 +147,7 @@ def claimed(comparison: Comparison) -> set[str]:
     return {each.name for each in found if each.different[1]}
 
 
+@pytest.mark.slow
 def test_between_like_runs_no_difference_is_claimed(empty: sqlite3.Connection) -> None:
     dice = random.Random(4)
     recorder = Recorder(empty)

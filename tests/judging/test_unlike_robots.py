@@ -8,6 +8,8 @@ from collections.abc import Callable
 from random import Random
 from typing import Any
 
+import pytest
+
 from tests.recordings.rover import start_run
 from webots_mcp.judging.checks.check_run import check_run
 from webots_mcp.judging.detection.event_options import EventOptions
@@ -128,6 +130,7 @@ def test_noise_of_a_gyro_that_grew_is_never_denied(empty: sqlite3.Connection) ->
     assert outcome(empty, "sensors keep their noise") == "not judged"
 
 
+@pytest.mark.slow
 def test_postures_of_a_joint_and_stops_of_a_lift_are_no_faults(
     empty: sqlite3.Connection,
 ) -> None:

@@ -85,6 +85,7 @@ def test_two_protos_that_hold_each_other_are_not_searched(tmp_path: Path) -> Non
     assert lint_world(world).verdicts()["physics"] == "not searched"
 
 
+@pytest.mark.slow
 def test_a_use_of_a_use_does_not_grow_without_an_end(tmp_path: Path) -> None:
     lines = ["DEF G0 Group { }"]
     lines += [f"DEF G{i} Group {{ children [ USE G{i - 1} USE G{i - 1} ] }}" for i in range(1, 60)]
@@ -104,6 +105,7 @@ def test_time_that_is_over_is_said(tmp_path: Path) -> None:
     assert any("not finished" in each.reason for each in report.not_searched)
 
 
+@pytest.mark.slow
 def test_a_crowd_in_one_place_ends(tmp_path: Path) -> None:
     solids = "\n".join(
         f'Solid {{ name "s{i}" boundingObject Box {{ }} physics Physics {{ }} }}'

@@ -324,6 +324,7 @@ def assert_readable(texts: list[tuple[str, Any]], size: tuple[int, int]) -> None
         assert wide < 2 or high < 2, f"{text!r} and {other!r} overlap by {wide:.0f} x {high:.0f} px"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "module", ["webots_mcp.server.mcp_server", "webots_mcp.plotting", "webots_mcp"]
 )
@@ -340,6 +341,7 @@ def test_what_draws_waits_for_the_first_picture(module: str) -> None:
 # Long and short recordings ------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_recording_too_long_to_be_read_is_drawn_from_its_chunks(record: Record) -> None:
     connection = record(lambda t: {"v": 3.0 if t == 160 else 12.0, "x": t, "y": 0.0}, 31_000)
     assert make_chunks(connection, 100_000).done

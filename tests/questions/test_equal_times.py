@@ -82,6 +82,7 @@ def folder(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFact
     return made
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("asked", READING, ids=lambda each: each.name)
 def test_a_question_is_answered_or_refused_in_words(folder: Path, asked: Question) -> None:
     recording = RecordingAccess(folder / "webots.db", folder, read_only=True)

@@ -30,6 +30,8 @@ from webots_mcp.store.recording import RecordingAccess
 from webots_mcp.store.requests import OpenRequest, Requester
 from webots_mcp.testing import assert_same_commands
 
+pytestmark = pytest.mark.slow
+
 EDITED = AVOID.replace("NEAR_M = 0.35", "NEAR_M = 0.45")
 
 

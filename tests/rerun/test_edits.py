@@ -10,6 +10,8 @@ from tests.rerun.taping import AVOID, recorded, rerun_of, tapes
 from webots_mcp.database.tapes.tape import Tape
 from webots_mcp.rerun.running import Rerun
 
+pytestmark = pytest.mark.slow
+
 STATEFUL = AVOID.replace(
     "turning = 0\n",
     "turning = 0\nrounds = 0\nsmooth_m = 1.0\nphase = 0\n",

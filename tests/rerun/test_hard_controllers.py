@@ -12,6 +12,8 @@ from tests.rerun.taping import AVOID, data_dir_of, recorded, rerun_of, taped_run
 from webots_mcp.contract import DATABASE_NAME
 from webots_mcp.rerun.running import find_taped_run, rerun
 
+pytestmark = pytest.mark.slow
+
 LOOP = "while robot.step(step_ms) != -1:\n"
 NEAR = "        turning = 20\n"
 

@@ -13,6 +13,8 @@ from webots_mcp.database.tapes.tape import Tape, TapedCall, TapedRound
 from webots_mcp.rerun.difference import Commanded, GivenCommand, differences
 from webots_mcp.rerun.replayed_tape import ReplayedTape, ReplayEndedError
 
+pytestmark = pytest.mark.slow
+
 KEYS = TapedCall("Keyboard#1", "Keyboard", "getKey", [], "question")
 LENGTH = TapedCall("device:radio", "Receiver", "getQueueLength", [], "question")
 NEXT = TapedCall("device:radio", "Receiver", "nextPacket", [], "command")

@@ -23,6 +23,8 @@ from webots_mcp.contract import DATABASE_NAME
 from webots_mcp.errors import NothingRecordedError
 from webots_mcp.rerun.running import current_file, find_taped_run, newest_taped_run, rerun
 
+pytestmark = pytest.mark.slow
+
 FIVE = [
     ("", "arena.wbt"),
     ("", "arena_referee.wbt"),

@@ -30,6 +30,8 @@ from webots_mcp.rerun.recorded_source import RecordedSource, find_source
 from webots_mcp.rerun.replayed_tape import ReplayedTape, ReplayEndedError
 from webots_mcp.rerun.running import Rerun, find_taped_run, rerun
 
+pytestmark = pytest.mark.slow
+
 EACH_STEP = AVOID.replace("attach(robot)", "attach(robot, throttle_interval=1)")
 EDITS = (("NEAR_M = 0.35", "NEAR_M = 0.45"), ("turning = 20", "turning = 7"), ("5.0", "5.5"))
 

@@ -8,6 +8,8 @@ import pytest
 
 from tests.rerun.taping import recorded, rerun_of
 
+pytestmark = pytest.mark.slow
+
 # As Webots' package `vehicle`, in Python: its real library needs a car in the world.
 DRIVER = """\
 from math import inf

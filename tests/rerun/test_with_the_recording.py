@@ -44,6 +44,7 @@ def test_an_import_takes_the_tape_along_once(project: Path, tmp_path: Path) -> N
     assert tape_files(tmp_path) == tape_files(data_dir_of(project))
 
 
+@pytest.mark.slow
 def test_code_that_came_with_an_import_runs_only_for_a_person_who_trusts_it(
     project: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -71,6 +72,7 @@ def test_a_pool_takes_the_tape_along_with_pictures(project: Path, tmp_path: Path
     assert tape_files(other) == tape_files(data_dir_of(project))
 
 
+@pytest.mark.slow
 def test_a_tape_is_deleted_with_the_last_run_of_its_session(tmp_path: Path) -> None:
     recorded(tmp_path, duration_s=1.0)
     data_dir = data_dir_of(tmp_path)
@@ -86,6 +88,7 @@ def test_a_tape_is_deleted_with_the_last_run_of_its_session(tmp_path: Path) -> N
     assert not purged.problems
 
 
+@pytest.mark.slow
 def test_commands_and_parameters_of_the_old_run_are_given_again(tmp_path: Path) -> None:
     code = """\
 import json
@@ -138,6 +141,7 @@ while robot.step(step_ms) != -1:
     assert "setVelocity 6.0 instead of 4.5" in rerun_of(tmp_path, controller).text
 
 
+@pytest.mark.slow
 def test_an_exported_later_run_of_a_session_is_still_that_run(tmp_path: Path) -> None:
     controller = make_project(tmp_path, RESETS)
     record(tmp_path / "worlds" / "arena.wbt", data_dir_of(tmp_path), 4.0)

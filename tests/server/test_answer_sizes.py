@@ -82,6 +82,7 @@ def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return file
 
 
+@pytest.mark.slow
 async def test_robots_that_do_the_same_again_and_again_are_told_in_1500_tokens(
     fleet: Path,
 ) -> None:
@@ -149,6 +150,7 @@ async def test_every_default_answer_is_under_2000_tokens(big: Path) -> None:
         print("\n" + "\n".join(table))
 
 
+@pytest.mark.slow
 async def test_an_answer_that_was_asked_to_be_long_stays_under_what_clients_put_aside(
     big: Path,
 ) -> None:

@@ -323,6 +323,7 @@ _VALUES: Final = st.dictionaries(_NAMES, _PLAIN, min_size=1, max_size=5)
 _OWN: Final = st.fixed_dictionaries({}, optional={"robot": st.text(max_size=200)})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [each.name for each in all_questions() if each.of_controller])
 @given(_VALUES | st.fixed_dictionaries({"arguments": _VALUES}), _OWN)
 def test_a_suggested_call_has_all_that_its_tool_requires_and_nothing_else(

@@ -75,6 +75,7 @@ async def paused_by_hand(simulation: Simulation, client: Client) -> None:
     await until(why, lambda text: text == WAITING_IN_STEP)
 
 
+@pytest.mark.slow
 async def test_while_a_person_has_paused_webots_every_command_is_withdrawn_and_none_runs_later(
     soon: None, start: Callable[..., Simulation], filed: Recording, data_dir: Path
 ) -> None:
@@ -132,6 +133,7 @@ async def paused_in_webots(
     return simulation, Store(database, data_dir)
 
 
+@pytest.mark.slow
 async def test_what_a_controller_has_claimed_meanwhile_is_not_withdrawn(
     soon: None, start: Callable[..., Simulation], filed: Recording, data_dir: Path
 ) -> None:
@@ -152,6 +154,7 @@ async def test_what_a_controller_has_claimed_meanwhile_is_not_withdrawn(
     assert found == ["claimed", "cancelled"]
 
 
+@pytest.mark.slow
 async def test_a_step_that_takes_no_longer_than_others_is_not_taken_for_a_pause(
     soon: None, start: Callable[..., Simulation], filed: Recording, data_dir: Path
 ) -> None:
@@ -169,6 +172,7 @@ async def test_a_step_that_takes_no_longer_than_others_is_not_taken_for_a_pause(
         assert block() is not None
 
 
+@pytest.mark.slow
 async def test_a_loop_that_asks_seldom_gets_its_command(
     start: Callable[..., Simulation], filed: Recording, data_dir: Path
 ) -> None:
@@ -188,6 +192,7 @@ async def test_a_loop_that_asks_seldom_gets_its_command(
             assert done["outcome"] == "done"
 
 
+@pytest.mark.slow
 async def test_a_controller_that_a_signal_stopped_is_said_to_be_stopped(
     start: Callable[..., Simulation], filed: Recording, data_dir: Path
 ) -> None:
@@ -207,6 +212,7 @@ async def test_a_controller_that_a_signal_stopped_is_said_to_be_stopped(
         assert f"kill -CONT {pid}" in answer["hint"]
 
 
+@pytest.mark.slow
 async def test_a_controller_that_dies_while_a_command_waits_is_said_to_be_gone(
     start: Callable[..., Simulation], filed: Recording, data_dir: Path
 ) -> None:
@@ -235,6 +241,7 @@ async def test_the_answer_of_fast_names_the_mode_in_which_a_later_step_has_left_
         assert simulation.mode is Mode.PAUSE
 
 
+@pytest.mark.slow
 async def test_a_run_that_is_under_way_is_answered_when_a_person_pauses_it(
     soon: None, start: Callable[..., Simulation], filed: Recording, data_dir: Path
 ) -> None:
@@ -265,6 +272,7 @@ async def test_a_run_that_is_under_way_is_answered_when_a_person_pauses_it(
     assert simulation.mode is Mode.PAUSE
 
 
+@pytest.mark.slow
 def test_a_loop_that_computes_is_no_hang_until_it_is_silent_for_twice_the_limit(
     start: Callable[..., Simulation], filed: Recording, data_dir: Path
 ) -> None:

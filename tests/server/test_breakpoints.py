@@ -19,6 +19,7 @@ async def newest_state(client: Client) -> dict[str, Any]:
     return await ask_until(client, "webots_get_robot_state", lambda told: "state" in told)
 
 
+@pytest.mark.slow
 async def test_a_breakpoint_pauses_at_the_step_and_is_listed_and_removed(
     connect: Connect, driver: Driver
 ) -> None:

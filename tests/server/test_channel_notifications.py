@@ -107,6 +107,7 @@ def hit(rover: RecordedRobot, at_s: float, condition: str = "front_m < 0.1") -> 
     rover.event(at_s, "breakpoint", condition, data)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("way", WAYS)
 async def test_a_client_is_told_of_a_hit_by_every_transport(
     file: Path, rover: RecordedRobot, way: Way
@@ -128,6 +129,7 @@ async def test_a_client_is_told_of_a_hit_by_every_transport(
     assert all(re.fullmatch(r"[a-z_]+", name) for name in message.about)
 
 
+@pytest.mark.slow
 async def test_a_server_without_the_option_announces_and_sends_nothing(
     file: Path, rover: RecordedRobot
 ) -> None:
@@ -143,6 +145,7 @@ async def test_a_server_without_the_option_announces_and_sends_nothing(
     assert heard.heard == []
 
 
+@pytest.mark.slow
 async def test_a_server_that_only_reads_reports_a_violation_a_crash_and_trials(
     file: Path, rover: RecordedRobot
 ) -> None:
@@ -170,6 +173,7 @@ async def test_a_server_that_only_reads_reports_a_violation_a_crash_and_trials(
     assert "webots_get_logs(run_id=1)" in crash.content
 
 
+@pytest.mark.slow
 async def test_a_real_controller_that_hits_a_breakpoint_is_reported(
     file: Path, driver: Driver
 ) -> None:
@@ -180,6 +184,7 @@ async def test_a_real_controller_that_hits_a_breakpoint_is_reported(
     assert 'Condition "steps > 0", action "log"' in message.content
 
 
+@pytest.mark.slow
 async def test_what_arrives_long_after_it_happened_is_not_reported(
     file: Path, rover: RecordedRobot
 ) -> None:
@@ -192,6 +197,7 @@ async def test_what_arrives_long_after_it_happened_is_not_reported(
     assert message.about["sim_time_s"] == "2.000"
 
 
+@pytest.mark.slow
 async def test_a_recording_that_begins_later_is_reported_from_its_beginning(file: Path) -> None:
     async with listening(file, "memory-legacy") as (_, heard):
         recorded = Recorded(file)
@@ -201,6 +207,7 @@ async def test_a_recording_that_begins_later_is_reported_from_its_beginning(file
     assert message.about["run_id"] == "1"
 
 
+@pytest.mark.slow
 async def test_a_flood_is_sent_as_a_few_messages_and_a_count(
     file: Path, rover: RecordedRobot
 ) -> None:
@@ -254,6 +261,7 @@ def test_a_recorded_text_stays_within_its_quotes(text: object, shown: str) -> No
     assert quoted(text) == shown
 
 
+@pytest.mark.slow
 async def test_rows_that_no_bridge_wrote_end_nothing(file: Path, rover: RecordedRobot) -> None:
     async with listening(file, "memory-legacy") as (_, heard):
         with closing(sqlite3.connect(file)) as connection, connection:

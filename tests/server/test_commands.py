@@ -192,6 +192,7 @@ async def test_a_command_behind_a_handler_that_is_at_work_is_told_which(
     assert "until that handler has returned" in answer["hint"]
 
 
+@pytest.mark.slow
 async def test_what_is_under_way_at_the_deadline_is_left_alone(
     connect: Connect, controller: Callable[..., RecordedRobot], recorded: Recorded
 ) -> None:
@@ -231,6 +232,7 @@ async def test_an_asker_who_goes_away_takes_the_command_with_it(
     assert (command.status, command.error) == ("cancelled", "the client disconnected")
 
 
+@pytest.mark.slow
 async def test_waiting_reports_progress_every_second(connect: Connect, recorded: Recorded) -> None:
     recorded.robot()
     messages: list[str] = []

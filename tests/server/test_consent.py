@@ -102,6 +102,7 @@ def rows(file: Path) -> list[dict[str, Any]]:
         return newest_requests(connection, 100)[::-1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("way", WAYS)
 async def test_what_the_person_agrees_to_goes_on_and_both_are_recorded(
     file: Path, tunable: TunableDriver, way: Way
@@ -255,6 +256,7 @@ async def test_a_rule_that_is_changed_meanwhile_holds(file: Path) -> None:
     assert rows(file)[-1]["outcome"] == "refused"
 
 
+@pytest.mark.slow
 async def test_trials_ask_once_and_go_on_behind_the_answer(file: Path) -> None:
     allow(file, "actions = ['*', '?run', '?reset']")
     person = Person("accept", "accept")

@@ -65,6 +65,7 @@ async def lines_with(
     return await until(look, reached)
 
 
+@pytest.mark.slow
 async def test_a_server_records_what_the_controllers_of_its_project_print(
     tmp_path: Path, start_webots: StartWebots
 ) -> None:
@@ -81,6 +82,7 @@ async def test_a_server_records_what_the_controllers_of_its_project_print(
         assert "is followed" not in (await ask(client, "webots_get_logs")).get("hint", "")
 
 
+@pytest.mark.slow
 async def test_why_a_controller_never_recorded_is_told_before_there_is_a_run(
     tmp_path: Path, start_webots: StartWebots
 ) -> None:
@@ -113,6 +115,7 @@ async def test_a_webots_whose_controllers_record_elsewhere_is_not_followed(
         assert belongs(elsewhere, RecordingAccess(folder / "webots.db", folder)) == is_its
 
 
+@pytest.mark.slow
 async def test_a_server_that_only_reads_follows_nothing_and_says_so(
     tmp_path: Path, start_webots: StartWebots
 ) -> None:
@@ -212,6 +215,7 @@ async def test_a_controller_that_failed_after_another_run_is_named_until_one_rec
         assert "console" not in answer.get("why", "")
 
 
+@pytest.mark.slow
 async def test_the_command_line_follows_what_comes(recorded: Recorded, file: Path) -> None:
     robot = recorded.robot()
     robot.log(1.0, "first")
@@ -223,6 +227,7 @@ async def test_the_command_line_follows_what_comes(recorded: Recorded, file: Pat
         process.terminate()
 
 
+@pytest.mark.slow
 async def test_programs_follow_an_object_for_each_line(recorded: Recorded, file: Path) -> None:
     robot = recorded.robot()
     robot.log(1.0, "first")
@@ -235,6 +240,7 @@ async def test_programs_follow_an_object_for_each_line(recorded: Recorded, file:
         process.terminate()
 
 
+@pytest.mark.slow
 async def test_following_goes_on_with_its_robot_when_another_one_begins_to_record(
     recorded: Recorded, file: Path
 ) -> None:

@@ -15,6 +15,7 @@ pytestmark = pytest.mark.anyio
 TOOL = "webots_record_scene"
 
 
+@pytest.mark.slow
 async def test_a_movie_is_started_and_stopped_and_its_file_named(
     connect: Connect, driver: Driver
 ) -> None:

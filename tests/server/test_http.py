@@ -154,6 +154,7 @@ def shared_driver(shared: Http) -> Iterator[Driver]:
     driving.stop()
 
 
+@pytest.mark.slow
 async def test_nobody_gets_in_without_the_token_or_from_elsewhere(
     serve: Callable[..., Http],
 ) -> None:
@@ -191,6 +192,7 @@ async def test_nobody_gets_in_without_the_token_or_from_elsewhere(
     assert server.status() == (200 if os.name == "nt" else 503)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", ["auto", "legacy"])
 async def test_what_a_client_asks_that_goes_away_is_stopped(
     shared: Http, shared_driver: Driver, mode: Mode
@@ -224,6 +226,7 @@ async def test_what_a_client_asks_that_goes_away_is_stopped(
     assert [action for action, _ in ended] == ["run", "cancel_run"]
 
 
+@pytest.mark.slow
 async def test_over_http_there_are_the_same_tools_with_the_same_options(
     serve: Callable[..., Http], tmp_path: Path
 ) -> None:
@@ -250,6 +253,7 @@ async def test_however_many_clients_there_are_one_maintains_the_recording(file: 
     assert ours == {"webots-mcp maintainer": 1, "webots-mcp consoles": 1}
 
 
+@pytest.mark.slow
 async def test_it_ends_at_once_while_clients_wait(
     serve: Callable[..., Http], driver: Driver
 ) -> None:
@@ -301,6 +305,7 @@ async def test_the_token_is_its_owners_alone(capsys: pytest.CaptureFixture[str])
         assert "other users may read" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="others have one address of loopback")
 async def test_each_address_of_this_computer_that_it_serves_is_answered(
     serve: Callable[..., Http],
@@ -312,6 +317,7 @@ async def test_each_address_of_this_computer_that_it_serves_is_answered(
         assert (await asked.post(server.url, json=body)).status_code == 200
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name == "nt", reason="openssl is not everywhere")
 async def test_from_the_network_it_is_reached_by_tls_and_by_an_allowed_name(
     serve: Callable[..., Http], tmp_path: Path
@@ -462,6 +468,7 @@ async def test_at_the_limit_of_sessions_the_one_that_is_idle_for_longest_ends(
             assert await status(newest) == 200
 
 
+@pytest.mark.slow
 async def test_a_request_that_does_not_arrive_in_time_ends(serve: Callable[..., Http]) -> None:
     server = serve(headers_s=0.5, body_s=0.5)
     request = (

@@ -70,6 +70,7 @@ def _two_robots_of_the_past(data: Path) -> None:
     recorded.close()
 
 
+@pytest.mark.slow
 async def test_a_world_is_started_changed_and_ended(begin: Begin, project: Path) -> None:
     async with begin() as client:
         answer = await ask(client, "webots_launch_world", world="worlds/arena.wbt", mode="fast")
@@ -96,12 +97,14 @@ async def test_a_world_is_started_changed_and_ended(begin: Begin, project: Path)
         assert "rover" in await fail(client, "webots_quit")
 
 
+@pytest.mark.slow
 async def test_webots_ends_with_the_server_that_started_it(begin: Begin) -> None:
     async with begin() as client:
         family = _family(await ask(client, "webots_launch_world", world="arena.wbt", headless=True))
     await until(lambda: _are_gone(family))
 
 
+@pytest.mark.slow
 async def test_what_init_allows_is_enough_to_start_a_world_and_to_end_it(
     begin: Begin, project: Path
 ) -> None:
@@ -113,6 +116,7 @@ async def test_what_init_allows_is_enough_to_start_a_world_and_to_end_it(
         assert (await ask(client, "webots_quit"))["route"] == "process"
 
 
+@pytest.mark.slow
 async def test_where_nobody_records_the_answer_comes_in_time_and_says_why(begin: Begin) -> None:
     async with begin("from controller import Robot\nRobot().step(16)\n") as client:
         answer = await ask(client, "webots_launch_world", world="arena.wbt", timeout_wall_s=4)
@@ -123,6 +127,7 @@ async def test_where_nobody_records_the_answer_comes_in_time_and_says_why(begin:
         assert ended["route"] == "process"
 
 
+@pytest.mark.slow
 async def test_a_start_in_pause_says_how_to_go_on_also_beside_robots_of_the_past(
     begin: Begin, project: Path
 ) -> None:
@@ -138,6 +143,7 @@ async def test_a_start_in_pause_says_how_to_go_on_also_beside_robots_of_the_past
         assert (played["outcome"], played["route"]) == ("done", "websocket")
 
 
+@pytest.mark.slow
 async def test_a_robot_of_the_webots_that_was_started_here_names_what_is_to_end(
     begin: Begin,
 ) -> None:
@@ -148,6 +154,7 @@ async def test_a_robot_of_the_webots_that_was_started_here_names_what_is_to_end(
         await until(lambda: _are_gone(family))
 
 
+@pytest.mark.slow
 async def test_webots_that_ends_at_its_start_is_an_error_with_what_it_said(
     begin: Begin, project: Path
 ) -> None:
@@ -179,6 +186,7 @@ async def test_only_worlds_of_the_project_are_opened(
         assert said in await fail(client, tool, world=world)
 
 
+@pytest.mark.slow
 async def test_a_robot_that_is_no_supervisor_has_another_world_by_webots_itself(
     begin: Begin,
 ) -> None:
@@ -206,6 +214,7 @@ async def test_a_world_of_the_same_name_in_another_project_is_not_opened_instead
     assert f"only worlds in the folder of the current one, {foreign.parent}" in text
 
 
+@pytest.mark.slow
 async def test_an_observer_opens_another_world_for_a_robot_that_is_no_supervisor(
     begin: Begin, project: Path
 ) -> None:
@@ -222,6 +231,7 @@ async def test_an_observer_opens_another_world_for_a_robot_that_is_no_supervisor
         assert "its controller has ended; run " in loaded["evidence"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("controller", [CONTROLLER, PLAIN])
 async def test_a_webots_that_somebody_else_started_is_ended_by_a_supervisor_alone(
     begin: Begin, start_webots: StartWebots, project: Path, controller: str

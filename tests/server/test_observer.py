@@ -92,6 +92,7 @@ def moves(answer: dict[str, Any]) -> bool:
     return bool(answer.get("in_world")) and (in_world(answer)["ROVER"].get("speed_mps") or 0) > 0.05
 
 
+@pytest.mark.slow
 async def test_a_controller_that_knows_nothing_of_us_is_seen_and_asked_about(begin: Any) -> None:
     async with begin(DRIVES, "--mode=fast") as client:
         world = await once(client, "webots_get_world_info", moves)
@@ -111,6 +112,7 @@ async def test_a_controller_that_knows_nothing_of_us_is_seen_and_asked_about(beg
         assert len(json.dumps(world)) < 6000
 
 
+@pytest.mark.slow
 async def test_a_robot_that_is_no_supervisor_is_steered_by_the_observer(begin: Any) -> None:
     async with begin(PLAIN) as client:
         await once(client, "webots_get_world_info", lambda at: at.get("in_world"))
@@ -126,6 +128,7 @@ async def test_a_robot_that_is_no_supervisor_is_steered_by_the_observer(begin: A
         assert answers["reload"]["evidence"].endswith("began")
 
 
+@pytest.mark.slow
 async def test_a_controller_that_hangs_is_told_from_a_pause_and_ended_by_a_reload(
     begin: Any,
 ) -> None:
@@ -148,6 +151,7 @@ async def test_a_controller_that_hangs_is_told_from_a_pause_and_ended_by_a_reloa
         assert (answer["outcome"], answer["route"]) == ("done", "observer")
 
 
+@pytest.mark.slow
 async def test_a_loop_that_hangs_before_its_first_step_does_not_hold_up_the_observer(
     begin: Any,
 ) -> None:
@@ -163,6 +167,7 @@ async def test_a_loop_that_hangs_before_its_first_step_does_not_hold_up_the_obse
         assert (answer["outcome"], answer["route"]) == ("done", "observer")
 
 
+@pytest.mark.slow
 async def test_a_pause_by_hand_is_taken_back_by_the_observer(begin: Any) -> None:
     async with begin(DRIVES, "--stream") as client:
         await once(client, "webots_get_world_info", moves)
@@ -180,6 +185,7 @@ async def test_a_pause_by_hand_is_taken_back_by_the_observer(begin: Any) -> None
         assert answer["evidence"].startswith("simulation time advanced to ")
 
 
+@pytest.mark.slow
 async def test_an_observer_makes_exactly_the_steps_that_were_asked_for(begin: Any) -> None:
     async with begin(DRIVES, "--mode=realtime") as client:
         await once(client, "webots_get_world_info", moves)
@@ -195,6 +201,7 @@ async def test_an_observer_makes_exactly_the_steps_that_were_asked_for(begin: An
             assert advanced_s == pytest.approx(result["advanced_s"]) == steps * 0.016
 
 
+@pytest.mark.slow
 async def test_an_observers_steps_are_counted_across_resets(begin: Any) -> None:
     async with begin(RESETS, "--mode=realtime") as client:
         await once(client, "webots_get_world_info", lambda at: at.get("in_world"))

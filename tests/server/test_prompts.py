@@ -59,6 +59,7 @@ async def test_a_prompt_names_only_tools_and_parameters_that_a_reading_server_ha
                 assert {keyword.arg for keyword in call.keywords} <= set(parameters)
 
 
+@pytest.mark.slow
 async def test_the_calls_of_a_prompt_can_be_made_as_they_stand(story: Path) -> None:
     async with client_on(story) as client:
         for name, given in ARGUMENTS.items():

@@ -184,6 +184,7 @@ async def test_an_error_about_a_recording_has_what_the_right_call_needs(
         await recover(client, case)
 
 
+@pytest.mark.slow
 async def test_an_error_about_a_live_robot_has_what_the_right_call_needs(
     connect: Connect, tunable: TunableDriver
 ) -> None:

@@ -27,6 +27,7 @@ while robot.step(16) != -1:
 """
 
 
+@pytest.mark.slow
 async def test_a_reload_is_confirmed_by_the_new_controllers_run(
     start: Callable[..., Simulation], filed: Recording, data_dir: Path
 ) -> None:
@@ -44,6 +45,7 @@ async def test_a_reload_is_confirmed_by_the_new_controllers_run(
         assert earlier["run"]["ended_by"] == "reload"
 
 
+@pytest.mark.slow
 async def test_a_person_who_pauses_in_webots_is_one_of_the_reasons_told(
     start: Callable[..., Simulation], filed: Recording, data_dir: Path
 ) -> None:

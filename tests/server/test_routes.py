@@ -64,6 +64,7 @@ def in_project(
     return begin
 
 
+@pytest.mark.slow
 async def test_a_robot_that_is_no_supervisor_is_steered_by_webots_itself(in_project: Any) -> None:
     process, client = in_project(PLAIN, "--stream")
     async with client:
@@ -81,6 +82,7 @@ async def test_a_robot_that_is_no_supervisor_is_steered_by_webots_itself(in_proj
         assert fast["evidence"].startswith("Webots replied 'fast'; simulation time advanced")
 
 
+@pytest.mark.slow
 async def test_a_controller_that_hangs_is_freed_by_a_reload_of_webots(in_project: Any) -> None:
     _, client = in_project(HANGS, "--stream", "--mode=fast", ready="hangs")
     async with client:
@@ -110,6 +112,7 @@ async def test_a_loop_that_turns_is_asked_itself(in_project: Any) -> None:
     assert process.poll() is None
 
 
+@pytest.mark.slow
 async def test_without_stream_each_way_says_why_it_does_not_work(in_project: Any) -> None:
     _, client = in_project(PLAIN)
     async with client:
@@ -131,6 +134,7 @@ async def test_a_webots_without_any_controller_of_ours_is_found_and_steered(
     assert "run_id" not in answer
 
 
+@pytest.mark.slow
 async def test_a_reset_that_nothing_shows_is_not_told_as_a_start_without_stream(
     in_project: Any,
 ) -> None:
@@ -187,6 +191,7 @@ async def test_a_port_that_is_not_that_of_the_robot_is_not_steered_by_its_contro
     assert driver.is_alive()
 
 
+@pytest.mark.slow
 async def test_a_reset_that_webots_says_nothing_of_is_proven_by_the_run_that_begins(
     connect: Connect, recorded: Recorded
 ) -> None:
@@ -205,6 +210,7 @@ async def test_a_reset_that_webots_says_nothing_of_is_proven_by_the_run_that_beg
     assert (answer["route"], answer["evidence"]) == ("websocket", "run 2 began")
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="each system has its own keys")
 async def test_forced_keys_without_a_window_say_so(
     connect: Connect, recorded: Recorded, monkeypatch: pytest.MonkeyPatch

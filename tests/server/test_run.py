@@ -37,6 +37,7 @@ async def paused(client: Client) -> dict[str, Any]:
     return await ask(client, "webots_simulation_control", command="pause")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", ["auto", "legacy"])
 async def test_it_says_why_and_where_it_stopped_and_what_happened(
     connect: Connect, driver: Driver, mode: str
@@ -61,6 +62,7 @@ async def test_it_says_why_and_where_it_stopped_and_what_happened(
     assert driver.is_alive()
 
 
+@pytest.mark.slow
 async def test_out_of_wall_time_it_goes_on_and_a_second_call_gives_the_same_answer(
     connect: Connect, driver: Driver
 ) -> None:
@@ -80,6 +82,7 @@ async def test_out_of_wall_time_it_goes_on_and_a_second_call_gives_the_same_answ
         assert (await ask(client, "webots_get_robot_state"))["status"] == "paused"
 
 
+@pytest.mark.slow
 async def test_progress_is_in_simulated_seconds(connect: Connect, driver: Driver) -> None:
     reports: list[tuple[float, float | None, str]] = []
 
@@ -112,6 +115,7 @@ async def test_a_cancelled_call_leaves_the_simulation_as_then_says(
     assert driver.is_alive()
 
 
+@pytest.mark.slow
 async def test_a_step_whose_asker_leaves_long_after_it_was_claimed_ends_too(
     connect: Connect, driver: Driver
 ) -> None:
@@ -132,6 +136,7 @@ async def test_a_step_whose_asker_leaves_long_after_it_was_claimed_ends_too(
         assert ended["result"]["why"] == "it was cancelled before the last step"
 
 
+@pytest.mark.slow
 async def test_an_interrupt_that_meets_the_waiting_itself_ends_the_run(
     connect: Connect, driver: Driver, file: Path
 ) -> None:
@@ -171,6 +176,7 @@ async def test_a_picture_comes_beside_the_data(
         assert "webots_take_screenshot" in picture["see"]
 
 
+@pytest.mark.slow
 async def test_where_no_screenshot_comes_the_frame_of_that_step_does_and_the_answer_says_which(
     connect: Connect, driver: Driver, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -201,6 +207,7 @@ async def test_where_no_screenshot_comes_the_frame_of_that_step_does_and_the_ans
         assert Path(picture["file"]).is_file()
 
 
+@pytest.mark.slow
 async def test_what_cannot_end_is_refused_before_anything_is_sent(
     connect: Connect, driver: Driver
 ) -> None:
@@ -304,6 +311,7 @@ async def test_a_run_that_ended_before_its_row_was_written_is_told_of_all_the_sa
     assert answer["state"] == {"x": 1}
 
 
+@pytest.mark.slow
 async def test_two_at_once_are_refused(connect: Connect, driver: Driver) -> None:
     async with connect() as client:
         first = await ask(client, "webots_run", until="steps < 0", then="go_on", timeout_wall_s=0.3)

@@ -80,6 +80,7 @@ async def test_a_run_has_a_report_and_a_plot(connect: Connect, mode: Any) -> Non
     assert base64.b64decode(plot.blob).startswith(b"\x89PNG")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("where", ["memory", "stdio"])
 async def test_a_client_that_subscribes_is_told_when_the_run_ends(
     file: Path, rover: RecordedRobot, where: str
@@ -106,6 +107,7 @@ async def test_a_client_that_subscribes_is_told_when_the_run_ends(
     assert updated == [REPORT, REPORT_URI.replace("{run_id}", "2")]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("where", ["memory", "stdio"])
 async def test_a_client_that_listens_is_told_when_the_run_ends(
     file: Path, rover: RecordedRobot, where: str

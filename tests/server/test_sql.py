@@ -136,6 +136,7 @@ def recording(file: Path) -> Path:
     return file
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "tricks",
     [(*WRITES, *ESCAPES), TOO_MUCH, LONG_STEPS],
@@ -183,6 +184,7 @@ async def test_statements_that_take_long_do_not_keep_others_waiting(
         tasks.cancel_scope.cancel()
 
 
+@pytest.mark.slow
 async def test_a_database_in_memory_is_asked_in_the_same_way() -> None:
     database = MemoryDatabase()
     recorded = Recorded(database)

@@ -86,6 +86,7 @@ async def test_a_frame_that_is_taken_now_is_not_one_of_the_past(
         assert "--read-only" in await fail(client, "webots_get_camera", fresh=True)
 
 
+@pytest.mark.slow
 async def test_watching_reports_what_was_recorded_meanwhile(
     connect: Connect, driver: Driver
 ) -> None:
@@ -129,6 +130,7 @@ async def _steer(client: Client, driver: Driver, reports: list[str]) -> None:
     await control(client, "resume")
 
 
+@pytest.mark.slow
 async def test_watching_a_paused_robot_says_that_nothing_was_recorded_and_why(
     connect: Connect, driver: Driver
 ) -> None:

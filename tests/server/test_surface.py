@@ -178,6 +178,7 @@ async def test_a_former_choice_that_never_was_names_the_tools_of_today(
         assert "value" in await fail(client, "webots_edit_scene", action="set", path="X.y")
 
 
+@pytest.mark.slow
 async def test_the_schemas_of_answers_are_listed_where_they_are_asked_for(
     connect: Connect, recorded: Recorded
 ) -> None:
@@ -217,6 +218,7 @@ async def test_both_eras_are_served_in_memory(
         assert (await ask(client, "webots_get_robot_state"))["state"] == {"x": 1}
 
 
+@pytest.mark.slow
 async def test_over_stdio_a_server_without_a_database_starts_and_says_what_to_do(
     tmp_path: Path,
 ) -> None:

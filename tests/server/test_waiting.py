@@ -48,6 +48,7 @@ async def under_way(client: Client, file: Path, robot: RecordedRobot) -> int:
     return answer["command_id"]
 
 
+@pytest.mark.slow
 async def test_a_second_call_goes_on_waiting_for_what_is_under_way(
     connect: Connect, recorded: Recorded, file: Path
 ) -> None:

@@ -336,6 +336,7 @@ def test_a_newer_version_replaces_what_is_unchanged_and_keeps_what_is_not(
     assert parts[-1].plan()[0].after.startswith(b"# Mine\r\nwith both\nends\r\n\r\n<!-- webots-mcp")
 
 
+@pytest.mark.slow
 def test_init_adds_skills_on_request_and_says_what_it_kept(project: Path) -> None:
     def init(*options: str) -> tuple[int, dict[str, Any]]:
         ended = subprocess.run(

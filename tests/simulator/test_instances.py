@@ -7,6 +7,8 @@ import socket
 import subprocess
 from pathlib import Path
 
+import pytest
+
 from tests.simulator.conftest import StartWebots, free_port, wait_for_line
 from webots_mcp.simulator.instances import Instance, _arguments, instance_at, instances
 from webots_mcp.simulator.orders import give_order
@@ -17,6 +19,7 @@ def of(process: subprocess.Popen[str]) -> Instance:
     return found
 
 
+@pytest.mark.slow
 def test_how_a_webots_was_started_is_told(start_webots: StartWebots, world: Path) -> None:
     port = free_port()
     process = start_webots("--stream", "--mode=fast", "--stdout", f"--port={port}", world)

@@ -68,6 +68,7 @@ def test_a_reset_may_be_obeyed_without_a_word() -> None:
         assert (reply.text, reply.is_alive, server.heard) == (None, True, ["reset"])
 
 
+@pytest.mark.slow
 def test_without_stream_it_is_said_that_webots_hears_but_does_not_obey() -> None:
     with WebotsServer(streams=False) as server:
         for order in get_args(Order):
@@ -96,6 +97,7 @@ def test_the_words_that_pause_by_accident_are_never_sent() -> None:
         assert not {"w3d", "x3d"} & set(server.heard)
 
 
+@pytest.mark.slow
 def test_a_busy_main_thread_is_one_of_the_reasons_and_nothing_takes_longer_than_asked() -> None:
     with WebotsServer(streams=True, manner="busy") as server:
         began_s = time.monotonic()

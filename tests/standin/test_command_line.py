@@ -71,6 +71,7 @@ def test_its_exit_status_is_that_of_its_controllers(
     assert subprocess.run([*COMMAND, *arguments], check=False).returncode == status
 
 
+@pytest.mark.slow
 def test_it_ends_with_its_last_controller(world: Path, write_controller: WriteController) -> None:
     file = write_controller("import nothing_of_that_name", name="other")
     arguments = [str(world), f"--robot=rover={file}"]

@@ -94,6 +94,7 @@ def test_a_reload_reads_the_world_file_again(
         simulation.wait_for(lambda: simulation.time_s > 0.1)
 
 
+@pytest.mark.slow
 def test_a_controller_that_does_not_end_is_terminated(
     world: Path, write_controller: WriteController
 ) -> None:

@@ -72,6 +72,7 @@ def example(world: str, folder: Path) -> Simulation:
     return Simulation(EXAMPLES / "worlds" / world, mode="fast", environment=environment)
 
 
+@pytest.mark.slow
 def test_the_rover_wanders_and_records_itself(records: Records, tmp_path: Path) -> None:
     with example("arena.wbt", tmp_path) as simulation:
         simulation.wait_for(lambda: simulation.time_s > 12.0, timeout_s=30)

@@ -236,6 +236,7 @@ def test_a_controller_that_is_not_in_its_folder_is_not_started(
         assert simulation.controller("rover").pid is None
 
 
+@pytest.mark.slow
 def test_real_time_is_no_faster_than_the_clock(
     world: Path, write_controller: WriteController
 ) -> None:

@@ -24,6 +24,8 @@ from webots_mcp.server.mcp_server import create_server
 from webots_mcp.standin import Simulation
 from webots_mcp.standin.in_process import DEFAULT_WORLD
 
+pytestmark = pytest.mark.slow
+
 # It steers by a sequence that no sensor shows, so that only its own variables tell how it goes on.
 CONTROLLER = """
 from controller import Supervisor

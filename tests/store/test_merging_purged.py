@@ -24,6 +24,8 @@ from webots_mcp.store.purge import prune
 from webots_mcp.store.retention_limits import Limit, Retention
 from webots_mcp.store.runs import run_info
 
+pytestmark = pytest.mark.slow
+
 SIGNALS = (
     "SELECT name, kind, unit, path, reduction, role FROM signal "
     "WHERE robot_id = (SELECT id FROM robot WHERE name = 'rover') AND name NOT GLOB 'pose*' "

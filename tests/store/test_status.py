@@ -199,6 +199,7 @@ def test_a_controller_that_an_exception_ended_names_it(tmp_path: Path, managed: 
     assert "its controller ended by KeyError: 'speed'" in (status.why or "")
 
 
+@pytest.mark.slow
 def test_where_the_database_takes_no_rows_it_says_in_which_file_they_wait_and_since_when(
     tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:

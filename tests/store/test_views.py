@@ -197,6 +197,7 @@ def seen_by_tools(connection: sqlite3.Connection, robot_id: int, state: Any) -> 
     return x, y, yaw, number(motion.mode), *speeds
 
 
+@pytest.mark.slow
 def test_the_views_and_the_tools_take_the_same_signals_for_the_same_roles() -> None:
     states: list[dict[str, Any]] = [*PLACES, *MODES, *CHOICES, *SPEEDS]
     states += [*(state for state, _ in POSES), *some_states(400)]

@@ -67,6 +67,7 @@ while True:
 """
 
 
+@pytest.mark.slow
 def test_a_failure_ends_at_the_users_own_line(pytester: pytest.Pytester) -> None:
     pytester.makepyfile(failing="exit(3)", stuck=STUCK)
     pytester.makepyfile(
@@ -118,6 +119,7 @@ def test_a_failure_ends_at_the_users_own_line(pytester: pytest.Pytester) -> None
     )
 
 
+@pytest.mark.slow
 def test_an_error_that_the_package_does_not_explain_keeps_its_frames(
     pytester: pytest.Pytester,
 ) -> None:
@@ -132,6 +134,7 @@ def test_an_error_that_the_package_does_not_explain_keeps_its_frames(
     assert "recording.py:" in said
 
 
+@pytest.mark.slow
 def test_a_marker_that_no_parameter_takes_fails_its_test(pytester: pytest.Pytester) -> None:
     pytester.makepyfile(
         """
@@ -168,6 +171,7 @@ def test_a_marker_that_no_parameter_takes_fails_its_test(pytester: pytest.Pytest
     assert "webots_parameters takes names: webots_parameters(kp=3.0)" in said
 
 
+@pytest.mark.slow
 def test_a_controller_that_hangs_is_named_and_the_recordings_file_too(
     pytester: pytest.Pytester,
 ) -> None:
@@ -251,6 +255,7 @@ def test_no_fixture_takes_a_name_that_a_test_suite_may_use_itself(
     assert all(name.startswith("webots_") for name in names)
 
 
+@pytest.mark.slow
 def test_a_run_that_does_not_use_the_plugin_does_not_pay_for_it(pytester: pytest.Pytester) -> None:
     pytester.makepyfile(
         """

@@ -94,6 +94,7 @@ def test_a_controller_that_fails_fails_the_test_with_its_traceback(
         simulation.run_for(5)
 
 
+@pytest.mark.slow
 def test_two_simulations_of_a_test_do_not_share_their_recordings(
     webots_simulation: SimulationFactory, controller: Callable[[str], Path], tmp_path: Path
 ) -> None:
@@ -194,6 +195,7 @@ while robot.step(16) != -1:
 """
 
 
+@pytest.mark.slow
 def test_runs_that_do_not_repeat_fail_with_where_they_part(
     webots_simulation: SimulationFactory, controller: Callable[[str], Path]
 ) -> None:

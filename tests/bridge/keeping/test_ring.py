@@ -70,6 +70,7 @@ STATES = st.dictionaries(
 )
 
 
+@pytest.mark.slow
 @given(state=STATES)
 @pytest.mark.usefixtures("encoder")
 def test_any_state_that_is_held_is_kept_as_it_would_be_recorded(state: State) -> None:

@@ -40,6 +40,7 @@ def copied(copier: StateCopier, state: Any) -> Any:
     return None if found is None else found.state()
 
 
+@pytest.mark.slow
 @given(STATES)
 def test_a_copy_is_encoded_as_the_state_was(state: dict[str, Any]) -> None:
     copier = StateCopier()
@@ -49,6 +50,7 @@ def test_a_copy_is_encoded_as_the_state_was(state: dict[str, Any]) -> None:
     assert found.replaced == expected.replaced
 
 
+@pytest.mark.slow
 @given(STATES, STATES)
 def test_a_state_of_another_shape_is_never_copied_by_the_wrong_one(
     first: dict[str, Any], second: dict[str, Any]

@@ -175,6 +175,7 @@ def _store_breakpoint(connection: sqlite3.Connection, condition: str, by: str = 
     )
 
 
+@pytest.mark.slow
 def test_rows_of_a_loop_that_stands_still_are_written_by_the_maintainer(
     bridge: MCPBridge, file: Path, filed: Recording
 ) -> None:

@@ -327,6 +327,7 @@ for _ in range(10):
 """
 
 
+@pytest.mark.slow
 def test_threads_may_log_while_the_bridge_closes(file: Path, filed: Recording) -> None:
     line = [sys.executable, "-c", _LOGS_WHILE_IT_CLOSES, str(file.parent)]
     ended = subprocess.run(line, capture_output=True, text=True, check=False)

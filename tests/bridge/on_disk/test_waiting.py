@@ -41,6 +41,7 @@ def test_the_file_of_a_living_session_is_left_to_it(bridge: MCPBridge, file: Pat
     assert waiting_file(bridge).exists()
 
 
+@pytest.mark.slow
 def test_what_waits_when_a_bridge_closes_is_kept_and_said(
     robot: InProcessSupervisor, file: Path, filed: Recording, capfd: pytest.CaptureFixture[str]
 ) -> None:

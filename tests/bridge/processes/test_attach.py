@@ -9,6 +9,8 @@ from tests.bridge.processes.conftest import Start, has_states
 from tests.bridge.processes.test_control import wait
 from webots_mcp.standin import Mode
 
+pytestmark = pytest.mark.slow
+
 ATTACHED = """
 MCPBridge.attach(robot)
 while robot.step(16) != -1:

@@ -109,6 +109,7 @@ def test_an_exception_that_ends_the_controller_is_recorded_with_its_traceback(
     assert printed[-1] == "ZeroDivisionError: division by zero"
 
 
+@pytest.mark.slow
 def test_a_reader_that_reads_nothing_keeps_no_print_waiting(
     run: Run, filed: Recording, tmp_path: Path
 ) -> None:
@@ -131,6 +132,7 @@ sys.stdin.readline()
     assert len(filed.rows(LINES)) == 150
 
 
+@pytest.mark.slow
 def test_a_flood_of_lines_is_passed_on_whole_and_what_was_not_recorded_is_counted(
     run: Run, filed: Recording
 ) -> None:

@@ -19,6 +19,8 @@ from webots_mcp.standin.in_process import DEFAULT_WORLD
 from webots_mcp.steering.target_robot import find_target
 from webots_mcp.store.recording import view_robot
 
+pytestmark = pytest.mark.slow
+
 LOOP = """
 while robot.step(16) != -1:
     bridge.publish({"time": robot.getTime()})

@@ -23,6 +23,8 @@ from webots_mcp.standin.in_process import DEFAULT_WORLD
 from webots_mcp.store.recording import RecordingAccess as Store
 from webots_mcp.store.robot_status import WAITING_IN_STEP, Status
 
+pytestmark = pytest.mark.slow
+
 Script = Callable[..., "subprocess.Popen[str]"]
 
 HANGS = """

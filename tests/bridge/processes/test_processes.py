@@ -165,6 +165,7 @@ def test_a_person_reloading_in_webots_is_noticed_as_well(start: Start, filed: Re
     )
 
 
+@pytest.mark.slow
 def test_pause_step_resume_and_reset_work_on_a_real_controller(
     start: Start, filed: Recording
 ) -> None:
@@ -212,6 +213,7 @@ sys.stdin.readline()
 """
 
 
+@pytest.mark.slow
 def test_controllers_that_start_at_once_on_a_missing_database_all_come_up(
     script: Script, filed: Recording, data_dir: object
 ) -> None:

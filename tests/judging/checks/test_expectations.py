@@ -290,6 +290,7 @@ def recorded(tmp_path: Path) -> Iterator[tuple[Path, Recorder]]:
         yield file, recorder
 
 
+@pytest.mark.slow
 def test_the_command_ends_with_0_1_or_2_and_writes_what_continuous_integration_reads(
     recorded: tuple[Path, Recorder], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -64,6 +64,7 @@ def test_what_is_out_of_sight_is_no_device_without_a_value(name: str, expected: 
     assert check.outcome == expected
 
 
+@pytest.mark.slow
 def test_hardly_a_silence_at_a_random_moment_is_explained() -> None:
     dice = np.random.default_rng(3)
     explained = 0

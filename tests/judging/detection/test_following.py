@@ -24,6 +24,7 @@ def _hexapod(t: Array, random: Random, *, limp: bool, lag_s: float, gain: float)
     return columns
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("interval_s", [0.008, 0.02, 0.1, 0.25])
 @pytest.mark.parametrize(("lag_s", "gain"), [(0.0, 1.0), (0.3, 0.7)])
 def test_a_leg_that_goes_limp_is_found_whatever_its_lag(
@@ -42,6 +43,7 @@ def test_a_leg_that_goes_limp_is_found_whatever_its_lag(
     assert check.outcome == "fail"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("interval_s", [0.008, 0.02, 0.1, 0.25])
 @pytest.mark.parametrize(("lag_s", "gain"), [(0.0, 1.0), (0.3, 0.7), (0.9, 0.4)])
 def test_a_healthy_hexapod_follows(interval_s: float, lag_s: float, gain: float) -> None:

@@ -80,6 +80,7 @@ def test_a_height_that_swings_more_and_more_is_found_though_the_target_ends_with
     assert check.outcome == outcome
 
 
+@pytest.mark.slow
 def test_of_steady_oscillations_hardly_one_is_said_to_grow() -> None:
     told = 0
     for number in range(40):

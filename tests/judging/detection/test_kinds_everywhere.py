@@ -137,6 +137,7 @@ def test_a_kind_is_found_judged_drawn_and_reported(
     assert any(kind in each for each in names_of_measures)
 
 
+@pytest.mark.slow
 def test_a_healthy_robot_has_none_of_them(robot: RecordedRobot) -> None:
     def healthy(time_s: float, rng: random.Random) -> dict[str, Any]:
         early = min(time_s, 39.0)

@@ -9,6 +9,7 @@ from tests.cases.columns import Array, Random, noise
 from tests.cases.situations import Columns, Situation, recorded
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("interval_s", [0.02, 0.064, 0.15])
 @pytest.mark.parametrize("factor", [4.0, 10.0])
 def test_the_onset_is_exact_to_a_few_rows(interval_s: float, factor: float) -> None:
@@ -26,6 +27,7 @@ def test_the_onset_is_exact_to_a_few_rows(interval_s: float, factor: float) -> N
         assert found.start_s == pytest.approx(onset_s, abs=max(0.5, 12 * interval_s))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("interval_s", [0.02, 0.064, 0.15])
 def test_noise_that_stays_is_no_event(interval_s: float) -> None:
     def draw(t: Array, random: Random) -> Columns:

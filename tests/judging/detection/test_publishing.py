@@ -65,6 +65,7 @@ def _told(connection: sqlite3.Connection, kind: str) -> Told:
     return Told(word, checks[_CHECKS[kind]], why, spans_s)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("interval_s", INTERVALS_S)
 @pytest.mark.parametrize("way", WAYS, ids=lambda way: way.name)
 def test_a_held_robot_is_found_or_not_searched_and_a_healthy_one_is_never_called_so(

@@ -58,6 +58,7 @@ def test_a_kind_that_is_entered_once_is_found_compared_told_and_drawn(
     assert lanes[0].name == "tilted" and len(lanes[0].intervals) == 2
 
 
+@pytest.mark.slow
 def test_nothing_but_its_own_module_and_the_registry_names_a_kind() -> None:
     """`log`, `run`, `missing` and the like are words of other things too."""
     names = {"oscillation", "jump", "flat"}

@@ -160,6 +160,7 @@ def test_rows_without_a_value_of_one_sensor_hide_no_slip(name: str) -> None:
     assert found.end_s == pytest.approx(_SLIPS_S[1], abs=1.5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("interval_s", [0.016, 0.05, 0.2])
 @pytest.mark.parametrize(
     "how",

@@ -48,6 +48,7 @@ def length_ms(file: str | Path) -> int:
     return length
 
 
+@pytest.mark.slow
 async def test_a_hit_is_shown_by_its_event_with_the_frames_before_it(
     connect: Connect, crash: Crash
 ) -> None:
@@ -85,6 +86,7 @@ async def test_an_event_of_a_search_names_the_id_that_a_clip_takes(
         assert f'"event_id":{event_id}' in text_of(found)
 
 
+@pytest.mark.slow
 async def test_without_a_moment_the_newest_hit_is_shown_else_the_end(
     connect: Connect, crash: Crash
 ) -> None:
@@ -100,6 +102,7 @@ async def test_without_a_moment_the_newest_hit_is_shown_else_the_end(
         assert told["signals"][0] == "front_m"
 
 
+@pytest.mark.slow
 async def test_where_only_poses_are_recorded_the_robot_moves_over_the_map(
     connect: Connect, crash: Crash
 ) -> None:
@@ -132,6 +135,7 @@ async def test_pictures_without_states_are_shown_too(connect: Connect, crash: Cr
     assert "signals" not in told
 
 
+@pytest.mark.slow
 async def test_of_several_cameras_one_is_chosen_and_the_others_are_named(
     connect: Connect, crash: Crash
 ) -> None:
@@ -147,6 +151,7 @@ async def test_of_several_cameras_one_is_chosen_and_the_others_are_named(
         assert "left, right" in why
 
 
+@pytest.mark.slow
 async def test_one_picture_is_enough_and_says_so(connect: Connect, crash: Crash) -> None:
     crash.drive().frame(HIT_S)
     async with connect() as client:
@@ -159,6 +164,7 @@ async def test_one_picture_is_enough_and_says_so(connect: Connect, crash: Crash)
     assert told["notes"] == [only]
 
 
+@pytest.mark.slow
 async def test_files_that_are_damaged_or_gone_are_left_out_and_counted(
     connect: Connect, crash: Crash
 ) -> None:
@@ -177,6 +183,7 @@ async def test_files_that_are_damaged_or_gone_are_left_out_and_counted(
     assert told["shows"].startswith("map"), "without a usable picture the map is shown"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [(1, 1), (640, 40), (40, 640), (161, 119), (3000, 2000)])
 async def test_pictures_of_any_size_fit_the_frame(
     connect: Connect, crash: Crash, size: tuple[int, int]
@@ -214,6 +221,7 @@ async def test_what_cannot_be_shown_is_refused_with_what_can(
         assert said in await fail(client, TOOL, **asked)
 
 
+@pytest.mark.slow
 async def test_an_event_of_another_run_or_robot_is_refused(
     connect: Connect, crash: Crash, recorded: Recorded
 ) -> None:
@@ -233,6 +241,7 @@ async def test_an_event_of_another_run_or_robot_is_refused(
         assert told["robot"] == "other"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("at_s", [0.0, 10.0])
 async def test_a_moment_at_the_edge_of_a_run_is_shown_as_far_as_it_was_recorded(
     connect: Connect, crash: Crash, at_s: float
@@ -254,6 +263,7 @@ async def test_a_run_without_anything_says_so(connect: Connect, recorded: Record
     assert "has no state and no picture" in text_of(result)
 
 
+@pytest.mark.slow
 async def test_speed_stretches_the_animation_and_a_gif_is_a_gif(
     connect: Connect, crash: Crash
 ) -> None:
@@ -267,6 +277,7 @@ async def test_speed_stretches_the_animation_and_a_gif_is_a_gif(
     assert told["frames"] == pytest.approx(41, abs=1)
 
 
+@pytest.mark.slow
 async def test_a_clip_of_noise_stays_within_its_size_and_processor_time(
     connect: Connect, crash: Crash
 ) -> None:
@@ -288,6 +299,7 @@ async def test_a_clip_of_noise_stays_within_its_size_and_processor_time(
         assert told["frames"] >= 8
 
 
+@pytest.mark.slow
 async def test_a_read_only_server_shows_the_sheet_and_writes_nothing(
     connect: Connect, crash: Crash
 ) -> None:
@@ -298,6 +310,7 @@ async def test_a_read_only_server_shows_the_sheet_and_writes_nothing(
     assert not (crash.folder / "clips").exists()
 
 
+@pytest.mark.slow
 async def test_a_folder_that_takes_no_file_costs_only_the_animation(
     connect: Connect, crash: Crash
 ) -> None:
@@ -308,6 +321,7 @@ async def test_a_folder_that_takes_no_file_costs_only_the_animation(
     assert "cannot be written" in told["not_saved"]
 
 
+@pytest.mark.slow
 async def test_the_newest_fifty_clips_are_kept(
     connect: Connect, crash: Crash, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -326,6 +340,7 @@ async def test_the_newest_fifty_clips_are_kept(
     assert own.is_file()
 
 
+@pytest.mark.slow
 async def test_clips_of_one_moment_do_not_replace_each_other(
     connect: Connect, crash: Crash
 ) -> None:

@@ -6,6 +6,8 @@ import re
 from contextlib import closing
 from pathlib import Path
 
+import pytest
+
 from tests.plugins.clip.conftest import HIT_S, Crash
 from webots_mcp.database.connection import connect as connected
 from webots_mcp.plugins.page.page_data import film, page_request
@@ -36,6 +38,7 @@ def test_a_report_has_no_film_of_two_frames(crash: Crash, file: Path) -> None:
     assert "image/webp" not in html
 
 
+@pytest.mark.slow
 def test_the_page_shows_a_clip_at_the_cursor_or_says_why_not(crash: Crash, file: Path) -> None:
     crash.drive().film(5.0, 7.0)
     recording = RecordingAccess(file, file.parent)

@@ -34,6 +34,7 @@ def printed(tmp_path_factory: pytest.TempPathFactory) -> str:
     return out.getvalue()
 
 
+@pytest.mark.slow
 def test_answers_are_tables_for_people(printed: str) -> None:
     assert re.search(r"(?m)^ +name +value +unit +default +low +high ", printed)
     assert re.search(r"(?m)^ +speed +5 +rad/s +5 +0 +10 ", printed)
@@ -77,6 +78,7 @@ def test_it_ends_with_a_drive_and_not_with_a_reset() -> None:
     assert sum(arguments.get("for_s", 0) for _, _, arguments in drives) >= 20
 
 
+@pytest.mark.slow
 def test_a_second_one_in_the_same_folder_is_refused_as_long_as_the_first_runs(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -102,6 +104,7 @@ def test_everything_that_it_asks_can_be_asked() -> None:
         QUESTIONS[tool].arguments.model_validate(arguments)
 
 
+@pytest.mark.slow
 def test_an_answer_that_is_an_error_ends_it_with_one_sentence(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -111,6 +114,7 @@ def test_an_answer_that_is_an_error_ends_it_with_one_sentence(
     assert "'nobody'" in capsys.readouterr().out.partition(asked[0][1])[2]
 
 
+@pytest.mark.slow
 def test_as_json_its_answers_are_one_object(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -76,6 +76,7 @@ def required_by_viewers(schema: dict[str, Any]) -> None:
                 required_by_viewers(inner["items"])
 
 
+@pytest.mark.slow
 @settings(max_examples=15, deadline=None)
 @given(STATES)
 def test_states_read_back_as_they_were_published(
@@ -303,6 +304,7 @@ def read_path(value: Any, path: str) -> None:
     assert isinstance(value, (int, float, str))
 
 
+@pytest.mark.slow
 def test_memory_does_not_grow_with_a_recording_for_viewers(
     recorder: Recorder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

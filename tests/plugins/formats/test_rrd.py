@@ -75,6 +75,7 @@ def entity(name: str) -> str:
     return str(rerun.new_entity_path(["rover", "state", *parts]))
 
 
+@pytest.mark.slow
 @settings(max_examples=10, deadline=None)
 @given(STATES)
 def test_numbers_and_texts_read_back_as_they_were_published(
@@ -171,6 +172,7 @@ def test_groups_of_rows_follow_each_other(
     assert read.texts("/rover/state/mode") == ["a", "b"]
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows limits no file's size")
 def test_a_disk_that_is_full_ends_the_export_and_is_told(tmp_path: Path) -> None:
     import resource

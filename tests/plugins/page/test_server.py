@@ -39,6 +39,7 @@ def answer_and_headers(server: Server, path: str, **headers: str) -> tuple[int, 
     return status, text, response.headers
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("host", ["127.0.0.1:{}", "localhost:{}"])
 def test_the_page_is_for_this_computer(told: Server, host: str) -> None:
     status, text = answer(told, "", Host=host.format(told.port))
@@ -46,6 +47,7 @@ def test_the_page_is_for_this_computer(told: Server, host: str) -> None:
     assert "webots-mcp" in text
 
 
+@pytest.mark.slow
 def test_each_ended_run_is_listed_with_the_outcome_of_its_check_in_words(told: Server) -> None:
     def outcomes() -> dict[int, str]:
         status, text = answer(told, "look?robot=rover")
@@ -110,6 +112,7 @@ def test_without_the_key_of_the_printed_address_nothing_is_shown(told: Server, p
     assert told.path.strip("/") not in text
 
 
+@pytest.mark.slow
 def test_the_address_stays_until_there_is_another_token(
     serve: Callable[..., Server], tmp_path: Path
 ) -> None:
@@ -132,6 +135,7 @@ def test_no_other_page_can_hold_it_or_is_told_its_address(told: Server) -> None:
         assert headers["Referrer-Policy"] == "no-referrer"
 
 
+@pytest.mark.slow
 def test_only_so_many_tabs_are_open_at_once(serve: Callable[..., Server], tmp_path: Path) -> None:
     server = serve(tmp_path, "--read-only")
     answers = [answer(server, f"look?tab={tab}") for tab in range(LIMITS.tabs + 1)]
@@ -150,10 +154,12 @@ def test_a_port_that_is_taken_is_said(
     assert "Must be <= 65535" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_ctrl_c_ends_it_in_a_sentence(serve: Callable[..., Server], tmp_path: Path) -> None:
     assert serve(tmp_path).stop() == "webots-mcp: ended by SIGTERM\n"
 
 
+@pytest.mark.slow
 def test_what_strangers_send_leaves_nothing_on_the_terminal(
     serve: Callable[..., Server], tmp_path: Path
 ) -> None:
@@ -169,6 +175,7 @@ def test_what_strangers_send_leaves_nothing_on_the_terminal(
     assert server.stop() == "webots-mcp: ended by SIGTERM\n"
 
 
+@pytest.mark.slow
 def test_a_recording_that_is_refused_is_not_served(
     serve: Callable[..., Server], tmp_path: Path
 ) -> None:
@@ -206,6 +213,7 @@ def test_what_only_begins_like_this_computer_is_another_host(told: Server, host:
     assert answer(told, "", Host=host.format(told.port))[0] == 403
 
 
+@pytest.mark.slow
 def test_a_request_that_comes_byte_by_byte_is_not_waited_for(
     serve: Callable[..., Server], story: Path
 ) -> None:
@@ -223,6 +231,7 @@ def test_a_request_that_comes_byte_by_byte_is_not_waited_for(
     assert answer(server, "")[0] == 200
 
 
+@pytest.mark.slow
 def test_of_many_idle_connections_the_idlest_are_closed(told: Server) -> None:
     with ExitStack() as stack:
         address, more = ("127.0.0.1", told.port), 20

@@ -76,6 +76,7 @@ def test_what_the_page_cannot_read_is_said(told: Server) -> None:
     assert "cannot be read" in told.ask("look?run=one")["text"]
 
 
+@pytest.mark.slow
 def test_what_no_bridge_writes_is_said_on_the_page_and_logged_once(
     serve: Any, tmp_path: Path
 ) -> None:
@@ -88,6 +89,7 @@ def test_what_no_bridge_writes_is_said_on_the_page_and_logged_once(
     assert server.stop().count("Traceback") == 1
 
 
+@pytest.mark.slow
 def test_what_no_server_puts_into_chunks_is_beside_the_page(tmp_path: Path) -> None:
     build(tmp_path / DATABASE_NAME, 2 * MIN_ROWS_ON_DEMAND, chunked=False)
     recording = RecordingAccess(tmp_path / DATABASE_NAME, tmp_path, read_only=True)

@@ -117,6 +117,7 @@ def pool(shipped: Place) -> Iterator[Pool]:
 # -- shipping ---------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_each_table_of_two_recordings_is_in_the_pool_row_by_row(
     place: Place, story: sqlite3.Connection, bridge_recording: Path
 ) -> None:
@@ -237,6 +238,7 @@ def test_what_is_there_is_listed(pool: Pool, story: sqlite3.Connection) -> None:
     assert pool.progress(uuid) == {"shipped": 1}
 
 
+@pytest.mark.slow
 def test_one_select_is_answered_up_to_its_limit(pool: Pool) -> None:
     found = pool.select("SELECT id, 1.5 AS number, NULL, true FROM run ORDER BY id -- etc.", 2)
     assert found.columns[:2] == ("id", "number")
@@ -262,6 +264,7 @@ REFUSED: list[tuple[str, dict[str, str]]] = [
 ]
 
 
+@pytest.mark.slow
 def test_anything_else_than_a_select_is_refused_and_changes_nothing(
     shipped: Place, pool: Pool
 ) -> None:

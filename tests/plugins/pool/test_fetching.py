@@ -105,6 +105,7 @@ def without_course(answer: Any) -> Any:
     return answer
 
 
+@pytest.mark.slow
 @IN_EACH_POOL
 def test_a_run_of_full_rate_comes_back_with_the_same_answers_whatever_was_purged_since(
     lab: Lab, tmp_path: Path
@@ -194,6 +195,7 @@ def of_values(answer: Any) -> Any:
     return answer
 
 
+@pytest.mark.slow
 def test_of_a_run_whose_first_rows_were_purged_before_they_were_shipped_the_others_come(
     lab: Lab, rounds: Path
 ) -> None:
@@ -258,6 +260,7 @@ def test_kept_stretches_come_whole_though_only_chunks_were_shipped(
     assert found.unchunked == {}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("full", [True, False])
 def test_states_that_retention_moved_after_they_were_shipped_come_once(
     lab: Lab, rounds: Path, full: bool
@@ -281,6 +284,7 @@ def test_states_that_retention_moved_after_they_were_shipped_come_once(
     assert found == expected != []
 
 
+@pytest.mark.slow
 @IN_EACH_POOL
 def test_a_label_a_set_a_robot_and_a_time_say_which_runs_come(lab: Lab, runs: Recorded) -> None:
     database = runs.folder / DATABASE_NAME
@@ -395,6 +399,7 @@ def test_a_run_that_lacks_is_answered_with_the_nearest(lab: Lab, runs: Recorded)
         lab.fetch()
 
 
+@pytest.mark.slow
 def test_a_fetch_that_is_killed_leaves_whole_runs_and_is_gone_on_with(
     lab: Lab, runs: Recorded
 ) -> None:

@@ -51,6 +51,7 @@ def test_programs_read_json(ask: Ask, runs: Recorded) -> None:
     assert json.loads(ask("pool", "POOL", "trials", "--json"))["total"] == 1
 
 
+@pytest.mark.slow
 def test_a_select_is_answered_with_its_first_rows(ask: Ask) -> None:
     query = ("--sql", "SELECT label, NULL AS empty FROM run ORDER BY label")
     said = ask("pool", "POOL", *query, "-n", "2").splitlines()
@@ -62,6 +63,7 @@ def test_a_select_is_answered_with_its_first_rows(ask: Ask) -> None:
     assert (answer["columns"], len(answer["rows"])) == (["label", "empty"], 3)
 
 
+@pytest.mark.slow
 @IN_EACH_POOL
 def test_an_answer_has_the_limits_of_sql_and_is_json_for_strict_readers(ask: Ask) -> None:
     def refuse(constant: str) -> None:

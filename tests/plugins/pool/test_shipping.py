@@ -250,12 +250,14 @@ def test_a_recording_of_an_older_schema_is_not_shipped(shipped: Shipped) -> None
     assert not shipped.pool.exists()
 
 
+@pytest.mark.slow
 def test_a_second_shipper_of_the_same_recording_is_refused(shipped: Shipped) -> None:
     shipped.add_run()
     with shipping(shipped.pool, shipped.uuid), pytest.raises(PoolBusyError):
         shipped.ship()
 
 
+@pytest.mark.slow
 def test_a_pool_that_is_away_is_tried_again_and_then_gets_everything(shipped: Shipped) -> None:
     shipped.add_run()
     url = bucket.empty()
@@ -300,6 +302,7 @@ def ship_unwritable(shipped: Shipped, *, full: bool) -> str:
         return subprocess.run(line, check=True, stdout=subprocess.PIPE, text=True).stdout
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not unprivileged.POSSIBLE, reason="root may write everywhere")
 def test_a_recording_that_nobody_can_write_is_shipped(shipped: Shipped) -> None:
     shipped.add_run()
@@ -308,6 +311,7 @@ def test_a_recording_that_nobody_can_write_is_shipped(shipped: Shipped) -> None:
     assert pooled(shipped.pool, uuid) == rows
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not unprivileged.POSSIBLE, reason="root may write everywhere")
 def test_of_a_recording_that_nobody_can_write_a_copy_is_asked_for(shipped: Shipped) -> None:
     """It was to be shipped again when its run has ended, which it had."""
@@ -356,6 +360,7 @@ def test_a_row_that_is_larger_than_a_batch_is_shipped(shipped: Shipped) -> None:
     assert shipped.pooled() == shipped.rows()
 
 
+@pytest.mark.slow
 def test_more_changes_than_a_transaction_takes_are_shipped_in_several(shipped: Shipped) -> None:
     shipped.add_run()
     shipped.connection.execute(
@@ -445,6 +450,7 @@ def test_a_recording_that_is_not_there_yet_is_waited_for_and_one_in_its_place_is
     assert shipped.pooled() == shipped.rows()
 
 
+@pytest.mark.slow
 def test_what_comes_while_a_shipper_follows_is_shipped_with_all_that_it_refers_to(
     shipped: Shipped,
 ) -> None:

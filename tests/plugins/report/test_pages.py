@@ -32,6 +32,7 @@ from webots_mcp.plugins.report.words import cut, describe_event, length, number
 EVIL = "</script><script>window.harmed = true</script><img src=x onerror=alert(1)>"
 
 
+@pytest.mark.slow
 def test_it_tells_what_ran_as_it_was_recorded(page: Shown, recording: sqlite3.Connection) -> None:
     (sha256, versions) = recording.execute(
         "SELECT controller_sha256, json_extract(versions, '$.python') FROM session WHERE id = 1"
@@ -371,6 +372,7 @@ def test_pictures_whose_files_are_gone_are_counted(tmp_path: Path) -> None:
     assert "2 of the pictures of run 1 (2 files cannot be read)" in report.left_out
 
 
+@pytest.mark.slow
 def test_pictures_are_scaled_down_and_thinned_evenly_where_they_have_no_room(
     tmp_path: Path,
 ) -> None:

@@ -19,6 +19,7 @@ from webots_mcp.judging.detection.event_options import EventOptions
 pytestmark = pytest.mark.anyio
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("way", WAYS)
 async def test_since_when_is_it_stuck_is_one_call_in_both_eras_and_over_stdio(
     story: Path, way: Way
@@ -91,6 +92,7 @@ async def test_of_each_kind_it_is_told_whether_it_was_found_is_absent_or_was_not
     }
 
 
+@pytest.mark.slow
 async def test_what_find_events_does_not_show_is_named_by_time_and_a_cursor_shows_it(
     story: Path,
 ) -> None:

@@ -17,6 +17,7 @@ from webots_mcp.store.chunk_making import make_chunks
 pytestmark = pytest.mark.anyio
 
 
+@pytest.mark.slow
 async def test_every_answer_says_about_which_robot_and_run_and_as_of_when(story: Path) -> None:
     for tool, arguments in EVERY:
         answer = await tell(story, tool, **arguments)
@@ -47,6 +48,7 @@ async def test_numbers_too_large_to_reckon_with_are_not_called_silent(tmp_path: 
     assert answer["runs"][0]["numbers"]["big"] == {"replaced": {"beyond 1e100": 5}}
 
 
+@pytest.mark.slow
 async def test_raw_rows_come_in_pages_that_neither_repeat_nor_miss_one(story: Path) -> None:
     times: list[float] = []
     cursor: int | None = 0
@@ -77,6 +79,7 @@ async def test_trends_say_in_one_line_what_a_person_would_notice(story: Path) ->
     assert not says.keys() & {each.split(" ")[0] for each in told}
 
 
+@pytest.mark.slow
 async def test_answers_are_the_same_before_and_after_chunks_are_made(
     story: Path, tmp_path: Path
 ) -> None:

@@ -19,6 +19,7 @@ from webots_mcp.store.retention_limits import KEPT
 pytestmark = pytest.mark.anyio
 
 
+@pytest.mark.slow
 async def test_what_cannot_be_tried_is_refused_before_anything_is_done(
     connect: Connect, tunable: TunableDriver
 ) -> None:
@@ -53,6 +54,7 @@ async def test_what_cannot_be_tried_is_refused_before_anything_is_done(
         assert told["hint"] == "no trials were begun: webots_run_trials"
 
 
+@pytest.mark.slow
 async def test_a_trial_without_a_score_or_an_end_failed_and_is_not_zero(
     connect: Connect, tunable: TunableDriver
 ) -> None:
@@ -75,6 +77,7 @@ async def test_a_trial_without_a_score_or_an_end_failed_and_is_not_zero(
         assert "longer than 0.05 s" in row["why"]
 
 
+@pytest.mark.slow
 async def test_a_loop_that_hangs_fails_its_trial_with_the_time_that_it_reached(
     connect: Connect, tunable: TunableDriver, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -86,6 +89,7 @@ async def test_a_loop_that_hangs_fails_its_trial_with_the_time_that_it_reached(
         assert "no longer calls bridge.get_command()" in answer["state"]
 
 
+@pytest.mark.slow
 async def test_a_pause_by_somebody_else_stops_the_set_and_it_can_go_on(
     connect: Connect, tunable: TunableDriver
 ) -> None:
@@ -105,6 +109,7 @@ async def test_a_pause_by_somebody_else_stops_the_set_and_it_can_go_on(
         assert await value_of(client, "kp") == 2.0
 
 
+@pytest.mark.slow
 async def test_a_parameter_that_somebody_else_sets_stops_the_set(
     connect: Connect, tunable: TunableDriver
 ) -> None:

@@ -22,6 +22,7 @@ pytestmark = pytest.mark.anyio
 _MANY = attempts(64, exploring=100)  # trials, of which an answer shows about 50
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", ["auto", "legacy"])
 async def test_a_grid_is_tried_and_ranked_and_the_parameters_are_set_back(
     connect: Connect, tunable: TunableDriver, mode: str
@@ -67,6 +68,7 @@ async def test_a_grid_is_tried_and_ranked_and_the_parameters_are_set_back(
         assert last["parameters"]["kp"] == 4.0, "what was set back is of another run"
 
 
+@pytest.mark.slow
 async def test_a_trial_in_which_prune_holds_ends_there_and_ranks_below_those_with_a_score(
     connect: Connect, tunable: TunableDriver
 ) -> None:
@@ -87,6 +89,7 @@ async def test_a_trial_in_which_prune_holds_ends_there_and_ranks_below_those_wit
         assert "signals: distance" in said
 
 
+@pytest.mark.slow
 async def test_out_of_wall_time_they_go_on_and_a_second_call_waits(
     connect: Connect, tunable: TunableDriver
 ) -> None:
@@ -114,6 +117,7 @@ async def test_out_of_wall_time_they_go_on_and_a_second_call_waits(
     assert all(total == 16 and "of 16 trials" in message for _, total, message in reports)
 
 
+@pytest.mark.slow
 async def test_cancel_stops_after_the_current_trial_and_sets_the_parameters_back(
     connect: Connect, tunable: TunableDriver
 ) -> None:
@@ -134,6 +138,7 @@ async def test_cancel_stops_after_the_current_trial_and_sets_the_parameters_back
         assert again["state"] == "done"
 
 
+@pytest.mark.slow
 async def test_a_cancelled_call_ends_the_trial_that_runs_and_no_other_begins(
     connect: Connect, tunable: TunableDriver
 ) -> None:
@@ -161,6 +166,7 @@ async def test_a_cancelled_call_ends_the_trial_that_runs_and_no_other_begins(
         assert tunable.resets > resets
 
 
+@pytest.mark.slow
 async def test_a_trial_that_nobody_ran_because_the_controller_ended_says_why(
     connect: Connect, file: Path
 ) -> None:
@@ -177,6 +183,7 @@ async def test_a_trial_that_nobody_ran_because_the_controller_ended_says_why(
             assert (answer["over"], answer["trials"]) == (0, 1)
 
 
+@pytest.mark.slow
 async def test_more_trials_than_an_answer_holds_are_told_in_a_short_one(
     connect: Connect, tunable: TunableDriver
 ) -> None:

@@ -27,6 +27,7 @@ def test_a_folder_that_is_a_file_is_wrong(tmp_path: Path) -> None:
     assert found(tmp_path / "notes" / "webots.db", "Data folder").verdict == "wrong"
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not unprivileged.POSSIBLE, reason="permissions do not stop this user here")
 def test_a_folder_that_cannot_be_written_is_wrong(bridge_recording: Path, tmp_path: Path) -> None:
     folder = tmp_path / "artifact"

@@ -11,6 +11,8 @@ from tests.older_recording import make_older
 from tests.recordings.rows import Recorded
 from tests.setup.doctor.conftest import Look
 
+pytestmark = pytest.mark.slow
+
 BREAKS = "raise RuntimeError('the gear is gone')"
 
 

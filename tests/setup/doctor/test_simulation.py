@@ -125,6 +125,7 @@ def test_it_is_said_where_only_controllers_that_record_were_looked_at(
     assert "no controller computes" not in seen
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("neighbour", "said"),
     [
@@ -155,6 +156,7 @@ def test_controllers_that_record_nothing_are_found_by_their_simulator(
     assert "were not looked at" in look("Simulation").seen
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("options", [(), ("--stream", "--mode=realtime")])
 def test_that_webots_obeys_by_its_websocket_is_named_where_it_does(
     look: Look,
@@ -252,6 +254,7 @@ def test_a_controller_whose_steps_no_bridge_saw_is_told_of_while_it_lives_and_wh
     )
 
 
+@pytest.mark.slow
 def test_a_controller_that_records_nothing_and_hangs_is_found_as_a_child_of_its_webots(
     start_webots: StartWebots, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -274,6 +277,7 @@ def test_a_controller_that_records_nothing_and_hangs_is_found_as_a_child_of_its_
     assert "was started without --stream and does not obey" in running.seen
 
 
+@pytest.mark.slow
 def test_many_that_stand_in_one_simulation_are_told_once(
     look: Look, recorded: Recorded, start: Start
 ) -> None:

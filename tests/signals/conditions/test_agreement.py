@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from typing import Any, cast
 
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -17,6 +18,8 @@ from webots_mcp.standin import InProcessSupervisor
 from webots_mcp.store.reading.frame import read_frame
 from webots_mcp.store.reading.ranges import whole_run
 from webots_mcp.store.reading.segment import Deadline
+
+pytestmark = pytest.mark.slow
 
 Held = list[tuple[float, dict[str, Any]]]
 

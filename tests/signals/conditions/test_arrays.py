@@ -19,6 +19,8 @@ from webots_mcp.judging.detection.condition import holds_in
 from webots_mcp.signals.conditions import parse_condition
 from webots_mcp.signals.naming import find_position
 
+pytestmark = pytest.mark.slow
+
 COMPARISON: dict[str, Any] = {
     "<": operator.lt, "<=": operator.le, ">": operator.gt, ">=": operator.ge,
     "==": operator.eq, "!=": operator.ne,

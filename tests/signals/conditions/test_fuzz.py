@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from typing import Any
 
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from webots_mcp.errors import ConditionFailedError, InvalidConditionError
 from webots_mcp.signals.conditions import parse_condition
 from webots_mcp.signals.conditions.syntax import MAX_CHARACTERS
+
+pytestmark = pytest.mark.slow
 
 _PIECES = """
     x mode a.b pose lidar.min front[2] for and or not in is if else lambda def yield await 0.5 1

@@ -79,6 +79,7 @@ def all_the_time_that_objects_need() -> Iterator[None]:
         yield
 
 
+@pytest.mark.slow
 @settings(deadline=None, max_examples=150)
 @given(st.dictionaries(KEYS, VALUES, max_size=4))
 def test_whatever_is_published(state: dict[Any, Any]) -> None:

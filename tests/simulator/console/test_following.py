@@ -147,6 +147,7 @@ def test_two_who_follow_write_each_line_once_and_one_takes_over_from_the_other(
     assert holder_of(recorded.connection, job_of(instance)) is None
 
 
+@pytest.mark.slow
 def test_a_flood_is_cut_and_counted(recorded: Recorded, followed: tuple[WebotsServer, Any]) -> None:
     server, _ = followed
     server.log("stdout", "begin\n")
@@ -257,6 +258,7 @@ with WebotsServer(streams=False, port=int(sys.argv[1])) as server:
 """
 
 
+@pytest.mark.slow
 def test_a_killed_webots_ends_what_follows_it_and_its_successor_is_another(
     recorded: Recorded, follow: Callable[..., Any]
 ) -> None:
@@ -309,6 +311,7 @@ def test_a_database_that_comes_later_gets_what_was_said_before(tmp_path: Path) -
             recorded.close()
 
 
+@pytest.mark.slow
 def test_lines_that_meet_a_locked_database_are_written_once_it_is_free(
     recorded: Recorded, followed: tuple[WebotsServer, Any]
 ) -> None:

@@ -19,6 +19,8 @@ from webots_mcp.simulator.console import StandInConsole
 from webots_mcp.store.logs import MOST_WAITING
 from webots_mcp.store.recording import RecordingAccess
 
+pytestmark = pytest.mark.slow
+
 WORLD = """#VRML_SIM R2023b utf8
 WorldInfo { basicTimeStep 16 }
 Viewpoint { }

@@ -14,6 +14,8 @@ import pytest
 from webots_mcp.setup.observer_edits import CONTROLLER, with_observer
 from webots_mcp.standin import Simulation
 
+pytestmark = pytest.mark.slow
+
 WORLD = "#VRML_SIM R2025a utf8\nWorldInfo { basicTimeStep 16 }\n" + "".join(
     f'Robot {{ name "{name}" controller "{name}" supervisor TRUE translation {at} 0 0 }}\n'
     for at, name in enumerate(("plain", "bridged", "late", "large"))

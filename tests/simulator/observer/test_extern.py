@@ -35,6 +35,7 @@ def rows(file: Path) -> int:
             return 0
 
 
+@pytest.mark.slow
 def test_it_records_a_running_world_and_ends_with_it(extern_world: Path, tmp_path: Path) -> None:
     where = ["--data-dir", str(tmp_path / "data")]
     line = [sys.executable, "-m", "webots_mcp", "observe", "--json", *where]

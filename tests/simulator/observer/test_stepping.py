@@ -177,6 +177,7 @@ def observed(tmp_path: Path) -> Iterator[Observed]:
         observed.close()
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name == "nt", reason="Windows ends processes without a signal")
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_an_observer_that_a_signal_ends_lets_the_world_go_on(
@@ -206,6 +207,7 @@ def test_a_signal_ends_an_observer_that_is_blocked_in_a_step(observed: Observed)
     assert process.wait(60) in (-signal.SIGTERM, 128 + signal.SIGTERM)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name == "nt", reason="Windows ends processes without a signal")
 def test_the_observer_after_one_that_was_killed_lets_the_world_go_on(observed: Observed) -> None:
     first = observed.observe()

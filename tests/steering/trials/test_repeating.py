@@ -14,6 +14,8 @@ from webots_mcp.cli import main
 from webots_mcp.contract import DATA_DIR_VARIABLE
 from webots_mcp.standin import Simulation
 
+pytestmark = pytest.mark.slow
+
 Repeat = Callable[..., Any]
 NOISY = (
     '"x": x',

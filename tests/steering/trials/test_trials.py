@@ -43,6 +43,7 @@ def test_sets_are_tried_scored_ranked_and_their_runs_kept(
     assert list((project / "data" / "trials").iterdir()) == []
 
 
+@pytest.mark.slow
 def test_a_trial_ends_at_the_very_state_in_which_the_condition_holds(
     project: Path, plan: Plan, run: Run
 ) -> None:
@@ -70,6 +71,7 @@ def test_a_finished_plan_is_only_shown_and_again_begins_anew(
     assert rows(project, "SELECT count(*) FROM run") == [(2,)]
 
 
+@pytest.mark.slow
 def test_what_no_trial_can_have_ends_all_of_them_with_a_sentence(plan: Plan, run: Run) -> None:
     plan('score = "last(x)"\nfor_s = 0.2\n[grid]\nsped = [1.0, 2.0]')
     refused = run()

@@ -24,6 +24,8 @@ from webots_mcp.store.reading.segment import Deadline, Segment
 from webots_mcp.store.recording import OpenReaders, RecordingAccess
 from webots_mcp.store.retention_limits import Limit, Retention
 
+pytestmark = pytest.mark.slow
+
 ROWS = 3 * MIN_ROWS_ON_DEMAND
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from typing import Any
 
+import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
@@ -25,6 +26,7 @@ _VALUES = st.recursive(
 _STATES = st.dictionaries(_NAMES, _VALUES, max_size=3)
 
 
+@pytest.mark.slow
 @given(states=st.lists(_STATES, min_size=1, max_size=4), repeated=st.integers(1, 3))
 @example(states=[{"a": [1, 2]}, {"a": [3, 4]}], repeated=1)
 @example(states=[{"a": [1, 2]}, {"a": [3]}], repeated=1)

@@ -313,6 +313,7 @@ def test_a_late_row_at_the_time_between_two_groups_stays_behind_those_before_it(
     assert framed(empty).values("x") == before
 
 
+@pytest.mark.slow
 def test_the_chunks_of_a_run_cost_the_same_however_many_rows_others_have(
     empty: sqlite3.Connection,
 ) -> None:
@@ -346,6 +347,7 @@ def test_the_chunks_of_a_run_cost_the_same_however_many_rows_others_have(
     assert steps_of_a_new_run() < 1.5 * among_few
 
 
+@pytest.mark.slow
 def test_names_beyond_the_limit_are_not_looked_at(empty: sqlite3.Connection) -> None:
     recorder, calls = start_run(empty), 0
     state = {f"name{n}": n for n in range(20 * MAX_SIGNALS)}
@@ -369,6 +371,7 @@ def test_names_beyond_the_limit_are_not_looked_at(empty: sqlite3.Connection) -> 
     assert calls < 20 * len(state)  # to read them, and for names that there is room for
 
 
+@pytest.mark.slow
 def test_many_new_runs_are_each_looked_at_once(empty: sqlite3.Connection) -> None:
     recorder = start_run(empty)
     runs = 60

@@ -16,6 +16,8 @@ from webots_mcp.database.connection import connect
 from webots_mcp.store.chunk_making import MIN_ROWS_ON_DEMAND, make_missing_chunks
 from webots_mcp.store.recording import RecordingAccess
 
+pytestmark = pytest.mark.slow
+
 ROWS = 4 * MIN_ROWS_ON_DEMAND
 
 

@@ -135,6 +135,7 @@ def without_odd(value: Any) -> Any:
     return value
 
 
+@pytest.mark.slow
 @settings(max_examples=40, deadline=None)
 @given(STATES)
 def test_json_lines_read_back_as_the_rows(states: list[dict[str, Any]]) -> None:
@@ -152,6 +153,7 @@ def test_json_lines_read_back_as_the_rows(states: list[dict[str, Any]]) -> None:
             assert same(line, without_odd(expected(state)))
 
 
+@pytest.mark.slow
 @settings(max_examples=40, deadline=None)
 @given(STATES)
 def test_csv_reads_back_as_the_rows(states: list[dict[str, Any]]) -> None:

@@ -78,6 +78,7 @@ def test_an_export_after_a_purge_is_the_one_before_it(
     assert exported(rover, form, run_id=1, start_s=1.6, end_s=3.2) == (part, [])
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(STATES)
 def test_a_state_comes_back_as_it_was_whatever_its_names(state: dict[str, Any]) -> None:

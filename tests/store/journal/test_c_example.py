@@ -18,6 +18,8 @@ from webots_mcp.questions import all_questions
 from webots_mcp.standin import InProcessRobot
 from webots_mcp.store.recording import RecordingAccess
 
+pytestmark = pytest.mark.slow
+
 E_PUCK = bundled("examples") / "e_puck"
 CONTROLLERS = E_PUCK / "controllers"
 QUESTIONS: list[tuple[str, dict[str, Any]]] = [

@@ -105,6 +105,7 @@ def bits_of(value: float) -> str:
     return struct.pack(">d", value).hex()
 
 
+@pytest.mark.slow
 def test_every_number_is_read_back_to_the_last_bit(start: Start) -> None:
     process = start("numbers", "50000")
     assert process.stdout
@@ -191,6 +192,7 @@ def test_a_time_step_of_any_size_is_recorded_or_null(
 SEEDS = {"c99": "1", "c++11": "2"}
 
 
+@pytest.mark.slow
 def test_no_number_and_no_text_crashes_a_function_or_makes_a_line_that_does_not_fit(
     language: str, tmp_path: Path
 ) -> None:
@@ -312,6 +314,7 @@ def test_a_living_controller_is_live_and_its_complete_parts_are_deleted(
     end(process)
 
 
+@pytest.mark.slow
 def test_what_a_full_disk_cost_is_counted_and_reported(start: Start, tmp_path: Path) -> None:
     process = start()
     row = ["integer {} {:x}".format(hexed("i"), 7), "publish"]
@@ -388,6 +391,7 @@ def test_the_command_writes_the_header_and_no_other_file(
     assert len(C_HEADER.read_text().splitlines()) <= 600
 
 
+@pytest.mark.slow
 @pytest.mark.anyio
 @pytest.mark.parametrize("anyio_backend", ["asyncio"])
 async def test_a_server_that_began_before_the_database_answers_what_was_just_published(

@@ -23,6 +23,8 @@ from webots_mcp.errors import DatabaseError
 from webots_mcp.store.journal_intake import ingest_journals
 from webots_mcp.store.recording import RecordingAccess
 
+pytestmark = pytest.mark.slow
+
 LINES = 30
 
 

@@ -162,6 +162,7 @@ def test_a_file_that_names_no_robot_or_session_is_kept_and_named_by_status(
     assert f"{part(tmp_path).name} could not be read and was left as it is" in said
 
 
+@pytest.mark.slow
 def test_doctor_names_a_file_that_could_not_be_read(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

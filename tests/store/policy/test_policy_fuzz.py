@@ -25,6 +25,8 @@ from webots_mcp.plugins.page.page_orders import steer, tune
 from webots_mcp.server.mcp_server import create_server
 from webots_mcp.store.recording import RecordingAccess
 
+pytestmark = pytest.mark.slow
+
 # What ends the robot of the test is never allowed, and always asked for.
 ENDING = ("quit", "reload", "load_world")
 READING = ("get_scene", "get_field")

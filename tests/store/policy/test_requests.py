@@ -214,6 +214,7 @@ async def test_the_file_binds_a_project_whose_robots_record_outside_of_it(
         assert f"{away / 'webots-mcp.toml'}, line 2: actions = ['keep']" in said
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("robot")
 async def test_trials_stop_where_the_file_forbids_what_they_would_do_next(
     project: Path, file: Path
@@ -332,6 +333,7 @@ def test_whatever_queues_a_command_or_starts_webots_asks_for_permission_first() 
     assert {"dispatch.py:_enqueue", "launcher.py:begin", "server_commands.py:launch"} <= asking
 
 
+@pytest.mark.slow
 async def test_texts_of_a_recording_come_marked_as_data_once_in_an_answer(
     file: Path, robot: TunableDriver
 ) -> None:

@@ -153,6 +153,7 @@ def rules_against(action: str) -> list[str]:
     return [*by_tool, by_action]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("action", sorted(set(TOOLS_OF_ACTIONS) - HARMLESS))
 async def test_what_a_rule_forbids_is_done_by_no_route(
     project: Path, file: Path, action: str

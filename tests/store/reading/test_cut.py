@@ -22,6 +22,8 @@ from webots_mcp.store.reading.segment import Deadline, Segment
 from webots_mcp.store.registered_signals import RegisteredSignal
 from webots_mcp.store.signal_history import query_rows
 
+pytestmark = pytest.mark.slow
+
 ROWS = 8_000
 INTERVAL_S = 0.25
 MODES = {0.0: "rest", 500.0: "walk", 1500.0: "turn"}  # from when on

@@ -71,6 +71,7 @@ def test_clocks_that_add_up_are_meant() -> None:
     assert sum(time_s != shown_time(time_s) for time_s in TIMES) > ROWS / 2
 
 
+@pytest.mark.slow
 @settings(deadline=None, max_examples=12)
 @given(time_s=st.sampled_from(TIMES), beside_s=st.floats(-0.002, 0.002))
 def test_adjoining_ranges_hold_every_row_change_and_event_once(
@@ -87,6 +88,7 @@ def test_adjoining_ranges_hold_every_row_change_and_event_once(
         ]
 
 
+@pytest.mark.slow
 @settings(deadline=None, max_examples=30)
 @given(st.sampled_from(range(1, len(TIMES) - 1)))
 def test_a_shown_time_finds_its_row_and_no_other_within_the_millisecond(

@@ -52,6 +52,7 @@ def framed(connection: sqlite3.Connection) -> Frame:
     return read_frame(connection, segment, Deadline(60))
 
 
+@pytest.mark.slow
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
 @given(STATES, st.integers(0, 40), st.integers(0, 40))
 def test_chunks_and_rows_say_the_same(
@@ -77,6 +78,7 @@ def test_chunks_and_rows_say_the_same(
                 assert [*map(repr, old.values(name))] == [*map(repr, new.values(name))]
 
 
+@pytest.mark.slow
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
 @given(STATES, st.integers(0, 40), st.integers(0, 40))
 def test_zones_are_what_the_values_come_to(

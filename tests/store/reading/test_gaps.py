@@ -17,6 +17,8 @@ from webots_mcp.store.reading import frame_summary as reading
 from webots_mcp.store.reading.frame import read_frame
 from webots_mcp.store.reading.segment import Deadline, Segment
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture
 def short_chunks(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -51,6 +51,7 @@ LEVELS = st.sampled_from([0.0, 10.0, None, ()])  # the last: the row does not ho
 STRETCHES = st.lists(st.tuples(LEVELS, st.integers(1, 12)), min_size=1, max_size=30)
 
 
+@pytest.mark.slow
 @settings(max_examples=40, deadline=None)
 @given(STRETCHES)
 def test_chunks_and_rows_tell_the_same_spans(stretches: list[tuple[Any, int]]) -> None:

@@ -9,6 +9,7 @@ from collections.abc import Generator
 from contextlib import contextmanager
 from typing import Any
 
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -20,6 +21,8 @@ from webots_mcp.judging.trends import trends
 from webots_mcp.store.chunk_making import make_chunks
 from webots_mcp.store.reading.ranges import Scope, find_range
 from webots_mcp.store.signal_history import query_history
+
+pytestmark = pytest.mark.slow
 
 ROWS = 60
 INTERVAL_S = 0.1

@@ -150,6 +150,7 @@ def test_a_damaged_group_is_made_anew_before_its_rows_are_deleted(recorded: Reco
     assert contents(recorded.connection) == before
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("signals", [10, 60])
 def test_what_chunks_take_is_known_within_a_twentieth_of_what_sqlite_says(
     tmp_path: Path, signals: int
@@ -189,6 +190,7 @@ ASKED = (
 )  # fmt: skip
 
 
+@pytest.mark.slow
 def test_questions_are_answered_after_a_purge_as_before_it(tmp_path: Path) -> None:
     file = tmp_path / "webots.db"
     record_rounds(file)

@@ -93,6 +93,7 @@ def test_a_server_sets_what_nobody_has_set_and_what_an_earlier_server_had(
     assert in_force(db).state.size_bytes == 80 * MB
 
 
+@pytest.mark.slow
 def test_a_server_says_that_what_a_person_has_set_holds(filed: Recorded, tmp_path: Path) -> None:
     set_limits(filed.connection, {"state": Limit(size_bytes=60 * MB)}, "retain")
     line = [sys.executable, "-m", "webots_mcp", "serve", "--data-dir", str(tmp_path)]

@@ -116,6 +116,7 @@ def test_a_maintainer_purges_a_little_in_each_round(filed: tuple[Path, Recorded]
         upkeep(recorded.connection)
 
 
+@pytest.mark.slow
 def test_a_maintainer_checks_once_a_minute_and_at_once_where_the_limits_change(
     filed: tuple[Path, Recorded],
 ) -> None:
@@ -178,6 +179,7 @@ def test_a_purge_goes_in_small_writes_and_space_goes_back_while_rows_still_go(
     assert 0 < freed[len(freed) // 2] < freed[-1]
 
 
+@pytest.mark.slow
 def test_a_robot_that_records_meanwhile_loses_no_row(filed: tuple[Path, Recorded]) -> None:
     file, recorded = filed
     recorded.end_run("finished")

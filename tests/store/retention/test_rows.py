@@ -219,6 +219,7 @@ RETENTIONS = st.builds(
 RUNS = st.lists(st.tuples(st.integers(0, 30), st.booleans(), st.booleans()), max_size=5)
 
 
+@pytest.mark.slow
 @settings(
     max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None
 )

@@ -19,6 +19,8 @@ from webots_mcp.store.purge import Upkeep
 from webots_mcp.store.retention_limits import Limit, Retention
 from webots_mcp.store.retention_plan import plan
 
+pytestmark = pytest.mark.slow
+
 NO_LIMIT = Retention(Limit(), Limit(), Limit(), Limit(), Limit(), outlive=0)
 
 

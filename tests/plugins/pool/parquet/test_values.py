@@ -88,6 +88,7 @@ def test_chunks_come_back_with_every_value(database: Recorded, tmp_path: Path) -
     )
 
 
+@pytest.mark.slow
 def test_engines_read_numbers_without_a_word_of_json(database: Recorded, tmp_path: Path) -> None:
     shipped(tmp_path / "pool")
     with ParquetPool(str(tmp_path / "pool")) as pool:

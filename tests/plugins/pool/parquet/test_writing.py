@@ -60,6 +60,7 @@ def ids(rows: Sequence[PoolRow]) -> list[SQLValue]:
     return [row[0] for row in rows]
 
 
+@pytest.mark.slow
 def test_an_object_store_has_each_table_row_by_row(reader: sqlite3.Connection) -> None:
     url = bucket.empty()
     ship(reader, url)
@@ -86,6 +87,7 @@ def globbed_ids(name: str) -> list[int]:
     return [row["id"] for content in contents for row in records(io.BytesIO(content.getvalue()))]
 
 
+@pytest.mark.slow
 def test_killed_at_any_put_a_shipper_goes_on_and_each_row_is_there_once() -> None:
     write_all(bucket.empty(), STEPS)
     puts = Bucket.puts
@@ -147,6 +149,7 @@ def test_small_batches_are_gathered_in_one_file_a_day(tmp_path: Path) -> None:
     assert ids(pooled_rows(str(tmp_path), UUID, "log")) == list(range(1, 31))
 
 
+@pytest.mark.slow
 def test_a_large_file_is_over_and_another_begins(tmp_path: Path) -> None:
     with shipping(tmp_path) as shipment:
         for row_id in range(1, 8):
@@ -157,6 +160,7 @@ def test_a_large_file_is_over_and_another_begins(tmp_path: Path) -> None:
     assert ids(pooled_rows(str(tmp_path), UUID, "log")) == list(range(1, 8))
 
 
+@pytest.mark.slow
 def test_rows_may_come_that_lie_before_others_and_each_is_there_once(tmp_path: Path) -> None:
     kept = {*range(1, 900, 9), 500, 501, 505}
     with shipping(tmp_path) as shipment:
@@ -312,6 +316,7 @@ def test_a_full_folder_is_told_and_the_same_shipment_goes_on_once_there_is_room(
     assert list((tmp_path / "_incoming").iterdir()) == []
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not unprivileged.POSSIBLE, reason="this user may write everywhere")
 def test_a_folder_that_may_not_be_written_is_told(tmp_path: Path) -> None:
     with unprivileged.unwritable(tmp_path):

@@ -35,7 +35,7 @@ _OF_SINGLE_TOOLS = {
     "webots_mcp.judging.run_score", "webots_mcp.judging.run_series", "webots_mcp.judging.trends",
     "webots_mcp.lint.bodies", "webots_mcp.lint.scene", "webots_mcp.plotting.painting",
     "webots_mcp.plotting.signal_plot", "webots_mcp.plotting.trajectory",
-    "webots_mcp.plugins.clip.make_clip", "webots_mcp.plugins.report.make_report",
+    "webots_mcp.plugins.clip.clip", "webots_mcp.plugins.report.make_report",
     "webots_mcp.rerun", "webots_mcp.setup.doctor", "webots_mcp.standin", "webots_mcp.worlds",
 }  # fmt: skip
 

@@ -27,7 +27,7 @@ _HOMES = {  # the module of each name, and its name there
 
 # A tape has to begin before `Robot()` is made, which is before any name is asked for here.
 if {"WEBOTS_MCP_TAPE", "WEBOTS_INSTANCE_PATH", "WEBOTS_CONTROLLER_URL"} & os.environ.keys():
-    import_module("webots_mcp.bridge.taping").begin_if_wanted()
+    import_module("webots_mcp.bridge.tape_start").begin_if_wanted()
 
 
 def __getattr__(name: str) -> Any:

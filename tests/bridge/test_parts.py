@@ -22,7 +22,7 @@ from webots_mcp.bridge.journal import Heartbeat, Journal
 from webots_mcp.bridge.log_handler import LogHandler
 from webots_mcp.bridge.output_channel import OutputChannel
 from webots_mcp.bridge.parameters import Parameters
-from webots_mcp.bridge.pause import Pause
+from webots_mcp.bridge.pause_loop import Pause
 from webots_mcp.bridge.picture_files import PictureFiles
 from webots_mcp.bridge.printed_lines import PrintedLines
 from webots_mcp.bridge.publishing import Publisher
@@ -37,7 +37,7 @@ from webots_mcp.bridge.throttle import Throttle
 from webots_mcp.bridge.watchdog import Watchdog
 from webots_mcp.bridge.world_actions import WorldActions
 from webots_mcp.contract import VERSION
-from webots_mcp.database.pauses import Cause
+from webots_mcp.database.pause_states import Cause
 from webots_mcp.errors import CommandRefusedError
 from webots_mcp.signals.parameter import declare
 from webots_mcp.standin import InProcessSupervisor

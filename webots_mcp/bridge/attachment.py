@@ -17,7 +17,7 @@ from typing import Final
 from webots_mcp.bridge.claimed_commands import ClaimedCommand, Handlers
 from webots_mcp.bridge.error_report import ErrorReport
 from webots_mcp.bridge.journal import Journal
-from webots_mcp.bridge.pause import Pause
+from webots_mcp.bridge.pause_loop import Pause
 from webots_mcp.bridge.publishing import Publisher
 from webots_mcp.bridge.simulation import QUIT, Clock, Simulation, Step
 from webots_mcp.bridge.throttle import Throttle

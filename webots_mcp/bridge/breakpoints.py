@@ -10,12 +10,12 @@ from webots_mcp.bridge.encoding import plain
 from webots_mcp.bridge.error_report import cut, describe, storable
 from webots_mcp.bridge.full_rate import FullRateRecorder
 from webots_mcp.bridge.journal import Journal
-from webots_mcp.bridge.pause import Pause
+from webots_mcp.bridge.pause_loop import Pause
 from webots_mcp.bridge.recorder import Recorder
 from webots_mcp.bridge.registration import Registration
 from webots_mcp.bridge.simulation import Clock, CurrentRun, Simulation
 from webots_mcp.contract import BREAKPOINT_ACTIONS, MAX_BREAKPOINTS
-from webots_mcp.database.pauses import Cause
+from webots_mcp.database.pause_states import Cause
 from webots_mcp.database.stored_breakpoints import ARMED, OF_CONTROLLER, SET, VIOLATION
 from webots_mcp.errors import (
     ConditionFailedError,

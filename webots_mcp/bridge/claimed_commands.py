@@ -13,7 +13,7 @@ from typing import Any, Final, cast
 from webots_mcp.bridge.encoding import encode
 from webots_mcp.bridge.error_report import cut, storable
 from webots_mcp.bridge.journal import Journal
-from webots_mcp.bridge.pause import Pause
+from webots_mcp.bridge.pause_loop import Pause
 from webots_mcp.bridge.recorder import Recorder
 from webots_mcp.bridge.registration import Registration
 from webots_mcp.contract import BUILT_IN_ACTIONS

@@ -21,7 +21,7 @@ from webots_mcp.bridge.claimed_commands import (
 )
 from webots_mcp.bridge.error_report import describe
 from webots_mcp.bridge.journal import Heartbeat, Journal
-from webots_mcp.bridge.pause import PUMP_INTERVAL_S, Pause
+from webots_mcp.bridge.pause_loop import PUMP_INTERVAL_S, Pause
 from webots_mcp.bridge.simulation import Clock, Simulation
 from webots_mcp.contract import BUILT_IN_ACTIONS, ENDING, LOOPING
 from webots_mcp.database.session_cleanup import EXTERN

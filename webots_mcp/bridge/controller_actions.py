@@ -13,7 +13,7 @@ from webots_mcp.bridge.claimed_commands import Action, ClaimedCommand, Progress,
 from webots_mcp.bridge.error_report import describe
 from webots_mcp.bridge.full_rate import FullRateRecorder
 from webots_mcp.bridge.parameters import Parameters, setter_of
-from webots_mcp.bridge.pause import Pause
+from webots_mcp.bridge.pause_loop import Pause
 from webots_mcp.bridge.simulation import Clock
 from webots_mcp.errors import CommandRefusedError, InvalidInputError
 

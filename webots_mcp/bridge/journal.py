@@ -13,7 +13,7 @@ from webots_mcp.bridge.recorder import Recorder
 from webots_mcp.bridge.simulation import Clock
 from webots_mcp.contract import HEARTBEAT_INTERVAL_S
 from webots_mcp.database.heartbeat import LoopStatus
-from webots_mcp.database.pauses import PAUSED
+from webots_mcp.database.pause_states import PAUSED
 
 _NOT_LOST: Final = ("nan", "inf", "-inf", BYTES_AS_TEXT, TEXT_WITH_SURROGATES)
 _LEVELS: Final = {"stdout": "info", "stderr": "warning"}

@@ -35,10 +35,10 @@ if TYPE_CHECKING:
     import logging
 
     from webots_mcp.bridge.attachment import Attachment
+    from webots_mcp.bridge.branch_start import RestoredState
     from webots_mcp.bridge.capture import Capture
     from webots_mcp.bridge.claimed_commands import ClaimedCommand, Handler
     from webots_mcp.bridge.parameters import Parameter, V
-    from webots_mcp.bridge.restored import RestoredState
 
 _FALSE: Final = ("", "0", "false", "no", "off")
 _MOST_SECONDS: Final = 3600.0
@@ -113,7 +113,7 @@ class MCPBridge:
         from webots_mcp.bridge.error_report import ErrorReport
         from webots_mcp.bridge.session import BridgeSession
         from webots_mcp.bridge.simulation import Simulation
-        from webots_mcp.bridge.taping import find_tape
+        from webots_mcp.bridge.tape_start import find_tape
 
         keep_last_s = _seconds("keep_last_s", KEEP_LAST_VARIABLE, keep_last_s)
         hang_after_s = _seconds("hang_after_s", HANG_VARIABLE, hang_after_s)

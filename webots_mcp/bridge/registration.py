@@ -20,7 +20,7 @@ from webots_mcp.contract import (
     recorded_name,
 )
 from webots_mcp.database import session_cleanup
-from webots_mcp.database.pauses import PAUSED, STEPPING_WORLD
+from webots_mcp.database.pause_states import PAUSED, STEPPING_WORLD
 from webots_mcp.database.processes import process_identity
 from webots_mcp.database.transactions import transaction
 from webots_mcp.database.waiting_file import enter_robot, enter_session

@@ -12,12 +12,12 @@ from typing import Final
 from webots_mcp.bridge.breakpoints import Breakpoints
 from webots_mcp.bridge.claimed_commands import Action, ClaimedCommand, Progress, whole_number
 from webots_mcp.bridge.parameters import Parameters, setter_of
-from webots_mcp.bridge.pause import Pause
+from webots_mcp.bridge.pause_loop import Pause
 from webots_mcp.bridge.run_goal import Goal, Watch, read_goal
 from webots_mcp.bridge.simulation import Clock, Simulation, mode_now
 from webots_mcp.bridge.throttle import Throttle
 from webots_mcp.contract import MAX_STEPS, Then
-from webots_mcp.database.pauses import Cause
+from webots_mcp.database.pause_states import Cause
 from webots_mcp.errors import CommandRefusedError, ControllerEndedError, InterruptedCommandError
 
 _ROUND_S: Final = 0.05  # wall time of steps that a command makes before it serves the loop again

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from webots_mcp.bridge.attachment import Attachment, UnseenSteps
+from webots_mcp.bridge.branch_start import find_origin
 from webots_mcp.bridge.breakpoints import Breakpoints
 from webots_mcp.bridge.claimed_commands import ClaimedCommand, ClaimedCommands, Handlers, Reloads
 from webots_mcp.bridge.control import Control
@@ -19,13 +20,12 @@ from webots_mcp.bridge.full_rate import FullRateRecorder
 from webots_mcp.bridge.inspection_actions import InspectionActions
 from webots_mcp.bridge.journal import Heartbeat, Journal
 from webots_mcp.bridge.parameters import Parameters
-from webots_mcp.bridge.pause import Pause
+from webots_mcp.bridge.pause_loop import Pause
 from webots_mcp.bridge.picture_actions import PictureActions
 from webots_mcp.bridge.picture_files import PictureFiles
 from webots_mcp.bridge.publishing import Publisher
 from webots_mcp.bridge.recorder import Recorder
 from webots_mcp.bridge.registration import Registration, identify
-from webots_mcp.bridge.restored import find_origin
 from webots_mcp.bridge.run_goal import Watch
 from webots_mcp.bridge.running_actions import RunningActions
 from webots_mcp.bridge.scene_actions import SceneActions

@@ -18,7 +18,7 @@ from webots_mcp.bridge.claimed_commands import (
     Reloads,
     whole_number,
 )
-from webots_mcp.bridge.pause import Pause
+from webots_mcp.bridge.pause_loop import Pause
 from webots_mcp.bridge.simulation import Clock, Simulation, mode_now
 from webots_mcp.database.files import full_path
 from webots_mcp.database.location import require_world_of

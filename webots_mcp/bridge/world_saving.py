@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from webots_mcp.bridge.claimed_commands import Action, ClaimedCommand, Progress
-from webots_mcp.bridge.pause import Pause
+from webots_mcp.bridge.pause_loop import Pause
 from webots_mcp.bridge.simulation import Clock, Simulation
 from webots_mcp.bridge.throttle import Throttle
 from webots_mcp.contract import WORLD_ENDING, recorded_name

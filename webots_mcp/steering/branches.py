@@ -22,7 +22,7 @@ from anyio import CancelScope, to_thread
 
 from webots_mcp.contract import LOOPING, WORLD_ENDING, new_uuid
 from webots_mcp.database.files import make_folder
-from webots_mcp.database.pauses import PAUSED
+from webots_mcp.database.pause_states import PAUSED
 from webots_mcp.database.queue import fetch_command
 from webots_mcp.errors import (
     CommandRefusedError,

@@ -19,7 +19,7 @@ from webots_mcp.contract import (
     MODE_EVENT,
     host_name,
 )
-from webots_mcp.database.pauses import (
+from webots_mcp.database.pause_states import (
     PAUSE,
     PAUSED,
     SEEN_PAUSED_BY,

@@ -15,7 +15,7 @@ from webots_mcp.contract import (
     UNMOVED,
     host_name,
 )
-from webots_mcp.database.pauses import (
+from webots_mcp.database.pause_states import (
     HELD_ELSEWHERE,
     LEFT_PAUSED,
     PAUSED,

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
-from webots_mcp.database.pauses import paused_s
+from webots_mcp.database.pause_states import paused_s
 from webots_mcp.database.session_cleanup import find_dead_sessions
 from webots_mcp.database.transactions import transaction
 from webots_mcp.errors import InvalidInputError

@@ -15,7 +15,7 @@ from webots_mcp.contract import (
     HEARTBEAT_LATE_S,
     host_name,
 )
-from webots_mcp.database.pauses import (
+from webots_mcp.database.pause_states import (
     PAUSED,
 )
 from webots_mcp.database.processes import (

@@ -20,7 +20,7 @@ from webots_mcp.contract import (
     THROTTLE_VARIABLE,
 )
 from webots_mcp.database.connection import connect
-from webots_mcp.database.pauses import PAUSED
+from webots_mcp.database.pause_states import PAUSED
 from webots_mcp.database.schema import require_current
 from webots_mcp.errors import WebotsMCPError
 from webots_mcp.signals.parameter import Value as ParameterValue

@@ -18,7 +18,7 @@ from tests.bridge.conftest import Recording
 from tests.bridge.processes.conftest import PatientSimulation
 from tests.simulator.observer.conftest import STEP_MS, Watching
 from webots_mcp.database.connection import connect
-from webots_mcp.database.pauses import SET_FREE
+from webots_mcp.database.pause_states import SET_FREE
 from webots_mcp.database.stored_breakpoints import set_breakpoint
 from webots_mcp.setup.observer_edits import with_observer
 from webots_mcp.signals.conditions import parse_condition

@@ -100,8 +100,8 @@ def clip(
     It shows the recorded camera frames, or the robot on the map, with clock, mode and up to three
     curves. The file has at most 3 MB.
     """  # fmt: skip
+    from webots_mcp.plugins.clip.clip import make_clip
     from webots_mcp.plugins.clip.get_clip import facts_of
-    from webots_mcp.plugins.clip.make_clip import make_clip
     from webots_mcp.plugins.clip.moment import moment_at, moment_of_event, newest_moment
     from webots_mcp.store.reading.ranges import find_subject
     from webots_mcp.store.run_rows import fetch_run

@@ -19,7 +19,7 @@ from webots_mcp.questions.declaration import READS, question
 from webots_mcp.store.recording import RecordingAccess, RobotView
 
 if TYPE_CHECKING:
-    from webots_mcp.plugins.clip.make_clip import Clip
+    from webots_mcp.plugins.clip.clip import Clip
     from webots_mcp.plugins.clip.moment import Moment
 
 FOLDER: Final = "clips"  # in the data folder
@@ -84,7 +84,7 @@ def webots_get_clip(
     picture use webots_get_camera; for curves of a whole run use webots_plot. A film of the whole
     simulation view is made by webots_record_scene while it runs.
     """
-    from webots_mcp.plugins.clip.make_clip import make_clip
+    from webots_mcp.plugins.clip.clip import make_clip
 
     asked = _event(recording, event_id, at_s)
     if asked is not None and run_id not in (None, asked.run_id):

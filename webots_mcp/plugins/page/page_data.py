@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
-from webots_mcp.database.pauses import PAUSED
+from webots_mcp.database.pause_states import PAUSED
 from webots_mcp.errors import (
     InvalidInputError,
     NoDatabaseError,
@@ -28,7 +28,7 @@ from webots_mcp.plotting import changed_most
 from webots_mcp.plotting.interactive_svg import ROOM, signals_figure, way_figure
 from webots_mcp.plotting.signal_plot import SignalAxes, compose_signals
 from webots_mcp.plotting.trajectory import Obstacle, PlottedPath, TrajectoryAxes, compose_trajectory
-from webots_mcp.plugins.clip.make_clip import make_clip
+from webots_mcp.plugins.clip.clip import make_clip
 from webots_mcp.plugins.clip.moment import moment_at, newest_moment
 from webots_mcp.plugins.page.run_list import LIMITS as RUN_LIMITS
 from webots_mcp.plugins.page.run_list import listed_runs, run_choices

@@ -15,7 +15,7 @@ from webots_mcp.contract import VERSION
 from webots_mcp.database.files import make_folder, whole_file
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.plotting.interactive_svg import figure_part
-from webots_mcp.plugins.clip.make_clip import camera_film
+from webots_mcp.plugins.clip.clip import camera_film
 from webots_mcp.plugins.report.chapter import Chapter, chapter_of
 from webots_mcp.plugins.report.embedded_pictures import (
     EmbeddedPicture,

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from webots_mcp.contract import UNSEEN, host_name, instance_of
-from webots_mcp.database.pauses import PAUSED, SEEN_PAUSED, SEEN_RUNNING
+from webots_mcp.database.pause_states import PAUSED, SEEN_PAUSED, SEEN_RUNNING
 from webots_mcp.setup.doctor import (
     Diagnosis,
     Examined,

@@ -8,7 +8,7 @@ from typing import Final, Protocol
 
 from webots_mcp.bridge.journal import Heartbeat, Journal
 from webots_mcp.bridge.simulation import QUIT, Simulation, Step
-from webots_mcp.database.pauses import (
+from webots_mcp.database.pause_states import (
     BRIDGE_CLOSED,
     IN_WEBOTS,
     PAUSE,

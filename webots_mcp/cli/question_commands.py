@@ -38,7 +38,7 @@ from webots_mcp.errors import CommandRefusedError, InvalidInputError, NothingRec
 from webots_mcp.questions.argument_errors import faults_of
 from webots_mcp.questions.arguments import FOR_A_PERSON, SCOPE
 from webots_mcp.questions.declaration import Caller, Question, Reply
-from webots_mcp.store.recording import OpenReaders, RecordingAccess
+from webots_mcp.store.recording import OpenConnections, RecordingAccess
 
 # Options of arguments that have another name in all questions.
 OPTIONS: Final[Mapping[str, str]] = types.MappingProxyType(
@@ -168,8 +168,8 @@ def ask(question: Question, given: Mapping[str, Any], where: Where) -> Reply:
     """
     asks_controllers = question.has_caller  # reading also takes a row in the queue
     opened = where.recording(read_only=question.effect.reads and not asks_controllers)
-    with closing(OpenReaders()) as readers:
-        recording = replace(opened, readers=readers)
+    with closing(OpenConnections()) as connections:
+        recording = replace(opened, connections=connections)
         valid = _valid(question, given, recording)
         if {"signals", "pattern"} & {each.name for each in question.parameters}:
             make_chunks_first(recording)

@@ -55,7 +55,7 @@ from webots_mcp.store.chunk_making import make_chunks, make_missing_chunks
 from webots_mcp.store.journal_intake import MAINTAINER_BUDGET_S, ingest_journals
 from webots_mcp.store.project_file import ProjectWatch
 from webots_mcp.store.purge import Upkeep
-from webots_mcp.store.recording import OpenReaders, RecordingAccess
+from webots_mcp.store.recording import OpenConnections, RecordingAccess
 from webots_mcp.store.retention_limits import Asked, ask
 from webots_mcp.store.sql import describe_schema
 
@@ -107,8 +107,8 @@ def create_server(
         notify: Tell clients without being asked what happens; see `channel_notifications`.
     """
     asked = dict(limits or {})
-    readers = OpenReaders()
-    recording = RecordingAccess(database, data_dir, read_only, asked, readers=readers)
+    connections = OpenConnections()
+    recording = RecordingAccess(database, data_dir, read_only, asked, connections=connections)
     possible = [each for each in all_questions() if each.effect.reads or not read_only]
     shown = [each for each in possible if TIERS.index(each.tier) <= TIERS.index(tools)]
     names = {each.name for each in shown}
@@ -135,7 +135,7 @@ def create_server(
         },
         withheld={each.name for each in all_questions()} - {each.name for each in possible},
         cache_hints={"tools/list": _KEPT, "prompts/list": _KEPT, "resources/list": _KEPT},
-        lifespan=_lifespan(recording, readers, Upkeep(data_dir), asked, watch, notify),
+        lifespan=_lifespan(recording, connections, Upkeep(data_dir), asked, watch, notify),
     )
     add_resources(mcp, recording)
     add_run_resources(mcp, recording)
@@ -162,7 +162,7 @@ class _ChunkMaker(threading.Thread):
 
 def _lifespan(
     recording: RecordingAccess,
-    readers: OpenReaders,
+    connections: OpenConnections,
     retain: Upkeep,
     asked: Asked,
     updates: UpdateWatch,
@@ -216,7 +216,7 @@ def _lifespan(
             chunk_maker.ending.set()
             for watch in reversed(watches):
                 await to_thread.run_sync(watch.stop, abandon_on_cancel=True)
-            readers.close()
+            connections.close()
 
     return lifespan
 

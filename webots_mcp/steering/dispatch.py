@@ -42,6 +42,9 @@ class WaitingTimes:
     Attributes:
         poll_s: Between two reads of its row. A read by key takes microseconds, as
             PRAGMA data_version does, which misses commits of the same connection.
+        soon_poll_s: The same as long as it waits for less than `soon_s`: a loop that runs answers
+            within a few of its steps.
+        soon_s: See `soon_poll_s`.
         report_s: Between two reports of progress.
         block_search_s: Between two searches for what blocks the loop.
         outliving_s: How long an unclaimed command stays valid after the time limit. Usually the
@@ -49,6 +52,8 @@ class WaitingTimes:
     """
 
     poll_s: float = 0.004
+    soon_poll_s: float = 0.001
+    soon_s: float = 0.1
     report_s: float = 1.0
     block_search_s: float = 0.25
     outliving_s: float = 1.0
@@ -168,7 +173,7 @@ class Dispatcher:
         with self._recording.reader() as connection:
             view = find_target(connection, robot, action)
             require_parameters(view, action, params)
-        with self._recording.writer() as connection:
+        with self._recording.brief_writer() as connection:
             return CommandQueue(connection).enqueue(
                 view.robot.id,
                 action,
@@ -209,7 +214,8 @@ class Dispatcher:
                         doing = "waiting for the controller" if is_pending else "under way"
                         text = f"{command.action}: {doing} for {waited_s:.0f} s"
                         await self._report(waited_s, timeout_s, text)
-                await anyio.sleep(_TIMES.poll_s)
+                is_soon = waited_s < _TIMES.soon_s
+                await anyio.sleep(_TIMES.soon_poll_s if is_soon else _TIMES.poll_s)
             return command
 
     def _cancel_unclaimed(self, command: QueuedCommand) -> QueuedCommand:
@@ -221,7 +227,7 @@ class Dispatcher:
 
     def _leave(self, command: QueuedCommand) -> None:
         """Cancel a command whose caller has left; a `run` or `step` that has begun ends now."""
-        with self._recording.writer() as connection:
+        with self._recording.brief_writer() as connection:
             queue = CommandQueue(connection)
             is_running = queue.leave(command.id, "the client disconnected")
             if is_running and command.action in LOOPING:
@@ -229,7 +235,7 @@ class Dispatcher:
                 queue.enqueue(command.robot_id, "cancel_run", params, requested_by=asker)
 
     def _cancel(self, command_id: int, why: str) -> QueuedCommand:
-        with self._recording.writer() as connection:
+        with self._recording.brief_writer() as connection:
             CommandQueue(connection).cancel(command_id, why)
             return fetch_command(connection, command_id)
 
@@ -247,7 +253,7 @@ def withdraw_if_blocked(recording: RecordingAccess, command: QueuedCommand) -> b
     block = _block_of(recording, command)
     if block is None:
         return False
-    with recording.writer() as connection:
+    with recording.brief_writer() as connection:
         return CommandQueue(connection).cancel(command.id, f"{block.why}; {_WITHDRAWN}")
 
 

@@ -13,8 +13,9 @@ import time
 from collections.abc import Callable, Generator
 from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 from webots_mcp.contract import DATABASE_NAME
 from webots_mcp.database import session_cleanup
@@ -109,7 +110,7 @@ class RobotView:
 
     Attributes:
         state: The newest state of the run.
-        status: Whether time moves in this run.
+        is_newest: Whether the run is the robot's newest.
     """
 
     connection: sqlite3.Connection
@@ -117,7 +118,17 @@ class RobotView:
     run: RunRecord | None
     now_s: float
     state: StateRecord | None
-    status: Status
+    is_newest: bool
+
+    @cached_property
+    def status(self) -> Status:
+        """Whether time moves in this run, as of when it is first asked for: ask at once.
+
+        Who sends a command to a live robot does not need it, and saves a dozen statements.
+        """
+        if self.run is None or self.is_newest:
+            return decide_status(self.connection, self.session, self.run, self.now_s)
+        return _of_earlier_run(self.run, self.now_s)
 
     @property
     def session(self) -> SessionRecord | None:
@@ -193,7 +204,10 @@ class RobotView:
         return Subject(self.robot.id, self.robot.name, self.require_run().id)
 
 
-class OpenReaders:
+_Kind = Literal["reader", "reader past invalid rows", "writer"]
+
+
+class OpenConnections:
     """Connections that a server keeps open between its questions, each with its cache.
 
     A connection is used again if its file is still the one that it was opened for, and its schema
@@ -201,11 +215,13 @@ class OpenReaders:
     """
 
     def __init__(self) -> None:
-        self._idle: dict[bool, list[tuple[object, sqlite3.Connection]]] = {False: [], True: []}
+        self._idle: dict[_Kind, list[tuple[object, sqlite3.Connection]]] = {
+            "reader": [], "reader past invalid rows": [], "writer": [],
+        }  # fmt: skip
         self._is_closed = False
 
     @contextmanager
-    def taken(
+    def reader(
         self, database: Path, open_one: Callable[[], sqlite3.Connection]
     ) -> Generator[sqlite3.Connection]:
         """Lend a connection for one question; it is closed if the question fails.
@@ -213,7 +229,24 @@ class OpenReaders:
         Connections that leave out invalid rows are kept apart: their views take longer than a
         question.
         """
-        idle = self._idle[is_past_invalid_rows()]
+        kind: _Kind = "reader past invalid rows" if is_past_invalid_rows() else "reader"
+        with self._taken(kind, database, open_one) as connection:
+            shadow_if_asked(connection)
+            yield connection
+
+    @contextmanager
+    def writer(
+        self, database: Path, open_one: Callable[[], sqlite3.Connection]
+    ) -> Generator[sqlite3.Connection]:
+        """Lend a connection to write with; it is closed if that fails, or leaves a transaction."""
+        with self._taken("writer", database, open_one) as connection:
+            yield connection
+
+    @contextmanager
+    def _taken(
+        self, kind: _Kind, database: Path, open_one: Callable[[], sqlite3.Connection]
+    ) -> Generator[sqlite3.Connection]:
+        idle = self._idle[kind]
         while True:
             try:
                 known, connection = idle.pop()
@@ -225,13 +258,13 @@ class OpenReaders:
                 break
             connection.close()
         try:
-            shadow_if_asked(connection)
             yield connection
         except BaseException:
             connection.close()
             raise
         is_enough = len(idle) >= _CONNECTIONS.idle
-        if known is None or is_enough or isinstance(connection, FrozenConnection):
+        is_unfit = isinstance(connection, FrozenConnection) or connection.in_transaction
+        if known is None or is_enough or is_unfit:
             connection.close()
         else:
             idle.append((known, connection))
@@ -264,7 +297,7 @@ class RecordingAccess:
     Attributes:
         limits: The retention limits that the caller would like.
         asker: The source of commands: `mcp` or `cli`.
-        readers: Keeps connections open; None opens one for each question.
+        connections: Keeps connections open; None opens one for each question.
     """
 
     database: Database
@@ -272,7 +305,7 @@ class RecordingAccess:
     read_only: bool = False
     limits: Asked = field(default_factory=dict[str, Any])
     asker: str = "mcp"
-    readers: OpenReaders | None = None
+    connections: OpenConnections | None = None
 
     @contextmanager
     def reader(self) -> Generator[sqlite3.Connection]:
@@ -281,14 +314,14 @@ class RecordingAccess:
         What controllers wrote into journals is ingested first.
         """
         self.ingest()
-        if self.readers is None or not isinstance(self.database, Path):
+        if self.connections is None or not isinstance(self.database, Path):
             with self._opened("reader") as connection:
                 shadow_if_asked(connection)
                 yield connection
             return
         with (
             self._explained(),
-            self.readers.taken(self.database, lambda: self._open("reader")) as connection,
+            self.connections.reader(self.database, lambda: self._open("reader")) as connection,
         ):
             yield connection
 
@@ -296,6 +329,22 @@ class RecordingAccess:
     def writer(self) -> Generator[sqlite3.Connection]:
         """Open a connection that waits up to 5 s for the write lock."""
         with self._opened("writer") as connection:
+            yield connection
+
+    @contextmanager
+    def brief_writer(self) -> Generator[sqlite3.Connection]:
+        """Lend a kept connection to write with, for a statement or a short transaction.
+
+        Its settings must stay as they are. It waits up to 5 s for the write lock.
+        """
+        if self.connections is None or not isinstance(self.database, Path):
+            with self.writer() as connection:
+                yield connection
+            return
+        with (
+            self._explained(),
+            self.connections.writer(self.database, lambda: self._open("writer")) as connection,
+        ):
             yield connection
 
     @contextmanager
@@ -308,7 +357,8 @@ class RecordingAccess:
         """
         with self.reader() as connection:
             seen = view_robot(connection, robot, run_id)
-            may_ask = not self.read_only and run_id is None and not seen.status.is_moving
+            is_moving = seen.status.is_moving  # decided here, with all else that the view has
+            may_ask = not (is_moving or self.read_only) and run_id is None
             if may_ask and seen.session and ask_stuck(connection, seen.session, seen.now_s):
                 # As of the moment before: the signal may have woken the loop.
                 seen = view_of(connection, seen.robot, seen.now_s)
@@ -408,12 +458,8 @@ def view_of(
     """Return a view of a robot that is already known, and of that run or its newest one."""
     current = current_run(connection, robot.id)
     run = run or current
-    if run is None or run == current:
-        status = decide_status(connection, robot.session, run, now_s)
-    else:
-        status = _of_earlier_run(run, now_s)
     state = newest_state(connection, run.id) if run else None
-    return RobotView(connection, robot, run, now_s, state, status)
+    return RobotView(connection, robot, run, now_s, state, is_newest=run == current)
 
 
 def _of_earlier_run(run: RunRecord, now_s: float) -> Status:

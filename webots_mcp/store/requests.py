@@ -236,7 +236,7 @@ class OpenRequest:
             with suppress(DatabaseError):  # a refusal holds, whether or not it can be written
                 if self.id is None:
                     self._insert()
-                with self.recording.writer() as connection:
+                with self.recording.brief_writer() as connection:
                     connection.execute(
                         "UPDATE request SET rule = ? WHERE id = ?", (_bounded(error.rule), self.id)
                     )
@@ -251,7 +251,7 @@ class OpenRequest:
         with suppress(DatabaseError):
             if self.id is None:
                 self._insert()
-            with self.recording.writer() as connection:
+            with self.recording.brief_writer() as connection:
                 outcome = _bounded(f"{_ASKED}, by {error.rule}")
                 connection.execute(_END, (time.time(), outcome, self.id))
         error.request_id = self.id
@@ -267,7 +267,7 @@ class OpenRequest:
             "arguments": recorded_arguments(self._arguments),
             "robot": self._arguments.get("robot"),
         }
-        with self.recording.writer() as connection:
+        with self.recording.brief_writer() as connection:
             self.id = connection.execute(
                 "INSERT INTO request (uuid, wall_time_s, client, client_version, transport, "
                 "tool, arguments, run_id, sim_time_s) SELECT :uuid, :now, :client, :version, "
@@ -293,7 +293,7 @@ class OpenRequest:
         self.outcome = _PASSWORD.sub(_LEFT_OUT, self.outcome)
         for secret in _secrets_in(self._arguments):
             self.outcome = self.outcome.replace(secret, _LEFT_OUT)
-        with suppress(DatabaseError), self.recording.writer() as connection:
+        with suppress(DatabaseError), self.recording.brief_writer() as connection:
             connection.execute(_END, (time.time(), _bounded(self.outcome), self.id))
 
 
@@ -345,7 +345,7 @@ def note_answer(
         return
     rule = None if declined is None else _bounded(error.rule)
     outcome = f"{AGREED}, by {error.rule}" if declined is None else f"refused: {declined}"
-    with suppress(DatabaseError), recording.writer() as connection:
+    with suppress(DatabaseError), recording.brief_writer() as connection:
         connection.execute(
             "UPDATE request SET rule = ?, outcome = ?, finished_wall_time_s = ? WHERE id = ?",
             (rule, _bounded(outcome), time.time(), error.request_id),

@@ -21,7 +21,7 @@ from webots_mcp.store.purge import prune
 from webots_mcp.store.reading.frame import read_frame
 from webots_mcp.store.reading.ranges import Scope, find_range
 from webots_mcp.store.reading.segment import Deadline, Segment
-from webots_mcp.store.recording import OpenReaders, RecordingAccess
+from webots_mcp.store.recording import OpenConnections, RecordingAccess
 from webots_mcp.store.retention_limits import Limit, Retention
 
 pytestmark = pytest.mark.slow
@@ -41,9 +41,9 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def recording(built: Path, tmp_path: Path) -> Iterator[RecordingAccess]:
     shutil.copy(built, tmp_path / "webots.db")
-    readers = OpenReaders()
-    yield RecordingAccess(tmp_path / "webots.db", tmp_path, read_only=True, readers=readers)
-    readers.close()
+    connections = OpenConnections()
+    yield RecordingAccess(tmp_path / "webots.db", tmp_path, read_only=True, connections=connections)
+    connections.close()
 
 
 def in_chunks(recording: RecordingAccess) -> int:
@@ -120,5 +120,5 @@ def test_chunks_of_a_recording_that_is_gone_are_not_those_of_the_next(
     with closing(connect(recording.database, "writer")) as connection:
         connection.execute("UPDATE recording SET uuid = 'another'")
         connection.execute("DELETE FROM state WHERE id > 10")
-    recording.readers.close()  # type: ignore[union-attr]
+    recording.connections.close()  # type: ignore[union-attr]
     assert in_chunks(recording) == 0

@@ -43,7 +43,7 @@ from webots_mcp.plugins.page.page_orders import (
 )
 from webots_mcp.server.access_token import LOOPBACK, named_host, page_key
 from webots_mcp.store.chunk_making import make_missing_chunks
-from webots_mcp.store.recording import OpenReaders, RecordingAccess
+from webots_mcp.store.recording import OpenConnections, RecordingAccess
 
 HOST: Final = LOOPBACK[0]
 ORDERS: Final = ("pause", "resume", "step", "reset")
@@ -102,8 +102,11 @@ class PageServer(ThreadingHTTPServer):
 
     def __init__(self, recording: RecordingAccess, port: int, *, read_only: bool) -> None:
         super().__init__((HOST, port), _Request)
-        self._readers = OpenReaders()  # A tab asks five times a second.
-        self.recording, self.read_only = replace(recording, readers=self._readers), read_only
+        self._connections = OpenConnections()  # A tab asks five times a second.
+        self.recording, self.read_only = (
+            replace(recording, connections=self._connections),
+            read_only,
+        )
         self.steered = replace(self.recording, read_only=False)
         self.chunk_maker = ChunkMaker(self.recording)
         self.webots = WebotsSearch(self.recording)
@@ -127,7 +130,7 @@ class PageServer(ThreadingHTTPServer):
         finally:
             self.chunk_maker.stop()
             self.server_close()
-            self._readers.close()
+            self._connections.close()
 
     def process_request(self, request: Any, client_address: Any) -> None:
         """Serve a connection in its own thread; above the limit, close the idlest connection."""

@@ -27,7 +27,7 @@ from webots_mcp.simulator.launch import WebotsLaunch
 from webots_mcp.simulator.orders import WebotsAddress
 from webots_mcp.simulator.starting import LaunchedWebots, Mode, Start, free_port
 from webots_mcp.standin.in_process import DEFAULT_WORLD
-from webots_mcp.store.recording import OpenReaders
+from webots_mcp.store.recording import OpenConnections
 
 T = TypeVar("T")
 ROVER: Final = "rover"
@@ -94,8 +94,10 @@ class Bench:
         self.world = _write_project(folder)
         self.patience_s = patience_s
         self.where = Where(data_dir=folder / PROJECT_DATA_FOLDER)
-        self._readers = OpenReaders()  # It asks up to 30 times a second.
-        self.recording = replace(self.where.recording(read_only=False), readers=self._readers)
+        self._connections = OpenConnections()  # It asks up to 30 times a second.
+        self.recording = replace(
+            self.where.recording(read_only=False), connections=self._connections
+        )
         self._launch: WebotsLaunch | None = None
         self._never = set[tuple[bool, Mode | None]]()
         self._last_row = 0  # The newest row before the start of Webots.
@@ -150,7 +152,7 @@ class Bench:
     def close(self) -> None:
         """End the Webots that runs, and close the recording."""
         self.end()
-        self._readers.close()
+        self._connections.close()
 
     def end(self) -> None:
         """End the Webots that runs."""

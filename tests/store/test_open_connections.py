@@ -1,4 +1,4 @@
-"""A server's open readers answer from the file that is there."""
+"""A server's open connections answer from the file that is there."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ import pytest
 
 from webots_mcp.database.connection import connect
 from webots_mcp.database.schema import create_schema
-from webots_mcp.errors import NoDatabaseError
-from webots_mcp.store.recording import OpenReaders, RecordingAccess
+from webots_mcp.errors import DatabaseError, NoDatabaseError
+from webots_mcp.store.recording import OpenConnections, RecordingAccess
 
 
 @pytest.fixture
 def recording(tmp_path: Path) -> Iterator[RecordingAccess]:
     make(tmp_path / "webots.db", "first")
-    readers = OpenReaders()
-    yield RecordingAccess(tmp_path / "webots.db", tmp_path, readers=readers)
-    readers.close()
+    connections = OpenConnections()
+    yield RecordingAccess(tmp_path / "webots.db", tmp_path, connections=connections)
+    connections.close()
 
 
 def make(file: Path, name: str) -> None:
@@ -78,9 +78,9 @@ def test_a_file_that_was_damaged_is_opened_anew(recording: RecordingAccess, tmp_
 def test_what_is_in_use_when_the_server_ends_is_closed_when_it_is_given_back(
     recording: RecordingAccess,
 ) -> None:
-    assert recording.readers is not None
+    assert recording.connections is not None
     with recording.reader() as connection:
-        recording.readers.close()
+        recording.connections.close()
     with pytest.raises(sqlite3.ProgrammingError):
         connection.execute("SELECT 1")
 
@@ -98,3 +98,53 @@ def test_many_at_once_are_answered_each_by_a_connection_of_its_own(
     for thread in threads:
         thread.join()
     assert answers == ["first"] * 200
+
+
+def rename(recording: RecordingAccess, name: str) -> sqlite3.Connection:
+    with recording.brief_writer() as connection:
+        connection.execute("UPDATE recording SET uuid = ?", (name,))
+        return connection
+
+
+def test_a_connection_to_write_with_is_used_again_and_its_rows_are_seen_at_once(
+    recording: RecordingAccess,
+) -> None:
+    first = rename(recording, "second")
+    assert ask(recording) == "second"
+    assert rename(recording, "third") is first
+    assert ask(recording) == "third"
+
+
+def test_a_file_that_is_replaced_takes_the_next_write(
+    recording: RecordingAccess, tmp_path: Path
+) -> None:
+    rename(recording, "second")
+    make(tmp_path / "other.db", "other")
+    for ending in ("", "-wal", "-shm"):
+        (tmp_path / f"webots.db{ending}").unlink(missing_ok=True)
+    (tmp_path / "other.db").replace(tmp_path / "webots.db")
+    rename(recording, "third")
+    with closing(connect(tmp_path / "webots.db", "reader")) as connection:
+        assert uuid_of(connection) == "third"
+
+
+def test_a_transaction_that_is_left_open_is_undone_and_locks_nobody_out(
+    recording: RecordingAccess,
+) -> None:
+    with recording.brief_writer() as connection:
+        connection.execute("BEGIN IMMEDIATE")
+        connection.execute("UPDATE recording SET uuid = 'never'")
+    assert ask(recording) == "first"
+    assert rename(recording, "second") is not connection
+
+
+def test_a_connection_on_which_a_write_failed_is_closed(recording: RecordingAccess) -> None:
+    with (
+        pytest.raises(DatabaseError),
+        recording.brief_writer() as connection,
+    ):
+        connection.execute("INSERT INTO run (id) VALUES (NULL)")
+    with pytest.raises(sqlite3.ProgrammingError):
+        connection.execute("SELECT 1")
+    rename(recording, "second")
+    assert ask(recording) == "second"

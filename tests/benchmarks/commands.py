@@ -53,7 +53,7 @@ def measure_round_trip(bench: Bench) -> Iterable[Line]:
 
 def _lines(what: str, trips: list[float]) -> Iterable[Line]:
     taken = Samples([trips])
-    yield added(f"p50, {what}", taken.p50, "the loop's step", STEP_S, "ms", 20)
+    yield added(f"p50, {what}", taken.p50, "the loop's step", STEP_S, "ms", 10)
     yield added(f"p99, {what}", taken.above(0.99), "the loop's step", STEP_S, "ms")
 
 

@@ -156,6 +156,8 @@ class Dispatcher:
     ) -> QueuedCommand:
         try:
             command = await self._watch(command.id, claiming_s, block_noticed_s, withdraws=True)
+            if command.is_final:
+                return command
             command = await to_thread.run_sync(self._cancel_unclaimed, command)
             if command.is_final:
                 return command
@@ -219,8 +221,6 @@ class Dispatcher:
             return command
 
     def _cancel_unclaimed(self, command: QueuedCommand) -> QueuedCommand:
-        if command.is_final:
-            return command
         self._recording.settle()
         withdraw_if_blocked(self._recording, command)
         return self._cancel(command.id, "no controller claimed it in time; it will not run")

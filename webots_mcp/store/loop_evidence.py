@@ -234,14 +234,16 @@ def change_since_heartbeat(connection: sqlite3.Connection, session: SessionRecor
     return change_since(connection, session.id, *beat)
 
 
-def longest_pace_s(connection: sqlite3.Connection, run: RunRecord | None) -> float:
-    """Return how old the last movement may be, as heartbeats report it only once in a while."""
+def is_recent(connection: sqlite3.Connection, run: RunRecord | None, age_s: float) -> bool:
+    """Return whether a movement this long ago means that the loop runs.
+
+    Heartbeats report movements only once in a while, and rows may come seldom.
+    """
+    if age_s <= _LIMITS.still_moving_s + HEARTBEAT_INTERVAL_S:
+        return True
     interval_s = (recent_interval_s(connection, run.id) if run else None) or 0.0
-    pace_s = min(
-        max(_LIMITS.still_moving_s, _LIMITS.pace_intervals * interval_s),
-        _LIMITS.slowest_still_moving_s,
-    )
-    return pace_s + HEARTBEAT_INTERVAL_S
+    pace_s = min(_LIMITS.pace_intervals * interval_s, _LIMITS.slowest_still_moving_s)
+    return age_s <= pace_s + HEARTBEAT_INTERVAL_S
 
 
 class FileBacklog(NamedTuple):

@@ -33,9 +33,9 @@ from webots_mcp.store.loop_evidence import (
     find_stacks,
     handler_at_work,
     is_disconnected,
+    is_recent,
     is_sure_to_hang,
     is_unseen,
-    longest_pace_s,
     moved_wall_time_s,
     seen_by_observer,
     usual_step_s,
@@ -159,9 +159,8 @@ def _decide_alive(
     fresh = session.heartbeat_is_fresh(now_s)
     if fresh and change_since_heartbeat(connection, session) == RESUME:
         return Status(RUNNING)
-    pace_s = longest_pace_s(connection, run)
     if not is_unseen(session, moved_s) and (hang := find_hang(connection, session, now_s)):
-        is_slow = moved_s is not None and session.age_s(moved_s, now_s) <= pace_s
+        is_slow = moved_s is not None and is_recent(connection, run, session.age_s(moved_s, now_s))
         return Status(RUNNING, hang) if is_slow else _stopped(session, moved_s, now_s, hang)
     if not fresh and (backlog := find_backlog(connection, session)) is not None:
         moved_s = max(moved_s or 0.0, backlog.newest_wall_time_s)
@@ -171,14 +170,15 @@ def _decide_alive(
             f"next to it, for {waited} now (is the disk full, or does another program hold a "
             "lock?); what is shown here is older"
         )
-        if session.age_s(moved_s, now_s) <= pace_s:
+        if is_recent(connection, run, session.age_s(moved_s, now_s)):
             return Status(RUNNING, why)
         return _stopped(session, moved_s, now_s, why)
-    if moved_s is None and session.age_s(session.started_wall_time_s, now_s) <= pace_s:
+    started_ago_s = session.age_s(session.started_wall_time_s, now_s)
+    if moved_s is None and is_recent(connection, run, started_ago_s):
         return Status(
             STARTING, "its controller has just started; simulation time has not moved yet"
         )
-    if moved_s is not None and session.age_s(moved_s, now_s) <= pace_s:
+    if moved_s is not None and is_recent(connection, run, session.age_s(moved_s, now_s)):
         return Status(RUNNING, _why_unpublished(connection, session, run))
     return _stopped(session, moved_s, now_s, _why_standing(connection, session, moved_s, now_s))
 
@@ -227,7 +227,7 @@ def find_block(
     moved_s = moved_wall_time_s(connection, session, run)
     if session.heartbeat_is_fresh(now_s) or find_backlog(connection, session) is not None:
         return None
-    if moved_s is not None and session.age_s(moved_s, now_s) <= longest_pace_s(connection, run):
+    if moved_s is not None and is_recent(connection, run, session.age_s(moved_s, now_s)):
         return None
     if is_disconnected(session):
         fix = f"end process {session.pid}, start Webots, then the controller"
@@ -287,15 +287,14 @@ def _why_unpublished(
         return None
     row = newest_state(connection, run.id)
     since_s = run.started_sim_time_s if row is None else row.sim_time_s
-    usual_s = recent_interval_s(connection, run.id) or 0.0
     unpublished_s = session.sim_time_s - since_s
     beaten_since_s = session.last_seen_wall_time_s - (
         run.started_wall_time_s if row is None else row.wall_time_s
     )
-    if (
-        beaten_since_s <= max(_LIMITS.unpublished_s, _LIMITS.unpublished_intervals * usual_s)
-        or unpublished_s <= 0
-    ):
+    if beaten_since_s <= _LIMITS.unpublished_s or unpublished_s <= 0:
+        return None
+    usual_s = recent_interval_s(connection, run.id) or 0.0
+    if beaten_since_s <= _LIMITS.unpublished_intervals * usual_s:
         return None
     return unseen_report(session) or (
         f"its loop runs, but for {unpublished_s:.1f} s of simulation time it recorded no "

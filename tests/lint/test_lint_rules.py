@@ -69,6 +69,24 @@ CASES = {
     "a node where numbers belong": (
         "file", "Solid { translation Box {} }", "Solid { translation 0 0 1 }", "not a Box node",
     ),
+    "a field that is misspelt": (
+        "file",
+        "DirectionalLight {} WorldInfo { basicTimestep 16 }",
+        "DirectionalLight {} WorldInfo { basicTimeStep 16 lineScale 0.1 FPS 60 }",
+        "has no field basicTimestep; it has basicTimeStep",
+    ),
+    "a letter that is missing": (
+        "file",
+        robot(hinge(child=ARM, device=MOTOR % "maxVelocty 3 maxPosition 1 minPosition -1")),
+        robot(hinge(child=ARM, device=MOTOR % "maxVelocity 3 maxPosition 1 minPosition -1")),
+        "it has maxVelocity",
+    ),
+    "parameters of a second axis that a hinge does not have": (
+        "file",
+        robot(hinge(child=ARM, joint="jointParameters2 JointParameters {}")),
+        robot(hinge(child=ARM)),
+        "HingeJoint has no field jointParameters2",
+    ),
     "an axis without a direction": (
         "file",
         robot(hinge(child=ARM, axis="0 0 0", device=MOTOR % "maxPosition 1 minPosition -1")),
@@ -245,6 +263,27 @@ def test_a_fault_in_a_proto_names_its_file_and_line(tmp_path: Path) -> None:
     (fault,) = faults_of(lint_world(world), "inertia")
     assert fault.file == tmp_path / "protos" / "Ball.proto"
     assert (fault.path, fault.line) == ("ONE.physics.inertiaMatrix", 9)
+
+
+def test_a_field_that_its_proto_does_not_declare_is_reported_once_where_it_is_written(
+    tmp_path: Path,
+) -> None:
+    write_proto(
+        tmp_path, "Ball",
+        "#VRML_SIM R2023b utf8\nPROTO Ball [\n  field SFFloat heavy 1\n"
+        "  hiddenField SFFloat secret 1\n]\n{\n  Solid { }\n}\n",
+    )  # fmt: skip
+    world = write_world(
+        tmp_path,
+        "Ball {\n haevy 2\n secret 2\n}\nBall {\n colour 1 0 0\n}",
+        declared='EXTERNPROTO "../protos/Ball.proto"',
+    )
+    misspelt, unknown = faults_of(lint_world(world), "file")
+    assert "Ball.proto has no field haevy; it has heavy" in misspelt.what
+    assert unknown.what.startswith("Ball.proto has no field colour:")
+    assert misspelt.file == unknown.file == world
+    lines = world.read_text("utf-8").splitlines()
+    assert [lines[each.line - 1].split()[0] for each in (misspelt, unknown)] == ["haevy", "colour"]
 
 
 def test_a_heavy_body_that_sinks_into_soft_contacts_is_reported(tmp_path: Path) -> None:

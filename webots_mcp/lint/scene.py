@@ -164,6 +164,13 @@ class ProtoSource(NamedTuple):
     body: Sequence[Token]
 
 
+class UnknownField(NamedTuple):
+    """The PROTO that lacks a field which a node gives it."""
+
+    type_name: str
+    source: ProtoSource
+
+
 @dataclass(eq=False)
 class TreeNode:
     """A node of the scene tree.
@@ -305,6 +312,8 @@ class Scene:
         """URLs of EXTERNPROTO by the file that declares them."""
         self.cut = ""
         """Why a part of the scene was not read."""
+        self.unknown_fields: dict[tuple[Path, int, str], UnknownField] = {}
+        """Fields that a PROTO does not declare, by file, line and name."""
         self._deadline = deadline
         self._sources: dict[str, ProtoSource | str] = {}
         text = _text_of(world, "world")
@@ -404,6 +413,7 @@ class Scene:
                 return (node if node is written else written), source, files
             if source.file in files:
                 return written, f"{source.file.name} is made of itself", files
+            self._note_unknown(node, source)
             given = {key: deepcopy(each.default) for key, each in source.fields.items()}
             given |= {key: value for key, value in node.fields.items() if key in source.fields}
             try:
@@ -413,6 +423,12 @@ class Scene:
             files = (*files, source.file)
             node = base
         return node, "", files
+
+    def _note_unknown(self, node: WorldNode, source: ProtoSource) -> None:
+        """Note fields that the PROTO does not declare."""
+        for name in node.fields.keys() - source.fields.keys():
+            file, line = node.file or self.world, node.field_lines.get(name, node.line)
+            self.unknown_fields[file, line, name] = UnknownField(node.type_name, source)
 
     def _source(self, name: str) -> ProtoSource | str:
         if name not in self._sources:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from difflib import get_close_matches
 from math import pi
 from pathlib import Path
 from typing import Any, Final, cast
@@ -34,6 +35,8 @@ class RenderingEstimate:
 
 _RENDERING: Final = RenderingEstimate()
 _MOST_LINES: Final = 5
+_SIMILAR: Final = 0.7  # likeness of what may be meant by a name that is wrong in any case
+_SAME_WORD: Final = 0.9  # likeness of a misspelt name: one letter in six may differ
 _NO_FIELDS: Final[Mapping[str, FieldDefinition]] = {}
 _TAKES: Final = {
     "Bool": "TRUE or FALSE", "String": "a text in quotes", "Node": "a node or NULL",
@@ -54,6 +57,7 @@ class WorldRules:
         """Apply all rules."""
         self._report.judge("file")
         self._values()
+        self._field_names()
         self._time_step()
         self._undeclared()
         self._names()
@@ -77,6 +81,32 @@ class WorldRules:
                     f"{node.type_name}.axis is 0 0 0, which is no direction",
                     "Set axis to a direction, for example 0 1 0.",
                 )  # fmt: skip
+
+    def _field_names(self) -> None:
+        """Report fields that no PROTO declares, and misspelt fields of Webots' own nodes.
+
+        A field of Webots' own node that is like none of the known ones may be of another release.
+        """
+        for (file, line, name), (type_name, source) in self._scene.unknown_fields.items():
+            near = _likely_meant(name, source.fields, _SIMILAR)
+            has = f"; it has {near}" if near else ""
+            self._report.faults.append(
+                WorldFault(
+                    "file", "warning", f"{type_name}.{name}", file, line,
+                    f"{source.file.name} has no field {name}{has}: Webots ignores what is given",
+                    f"Write {near}." if near else f"Remove {name}, or add it to the PROTO.",
+                )
+            )  # fmt: skip
+        for node in self._scene.nodes:
+            types = NODE_TYPES.get("" if node.unread else node.type_name, _NO_FIELDS)
+            for name in node.fields.keys() - types.keys():
+                if near := _likely_meant(name, types):
+                    self._report.blame(
+                        "file", "warning", node, name,
+                        f"{node.type_name} has no field {name}; it has {near}, which keeps its "
+                        "default",
+                        f"Write {near}.",
+                    )  # fmt: skip
 
     def _time_step(self) -> None:
         info = self._scene.info
@@ -221,6 +251,13 @@ def _inside(node: TreeNode) -> list[TreeNode]:
         if child.type_name != "Robot":
             found += [child, *_inside(child)]
     return found
+
+
+def _likely_meant(name: str, known: Iterable[str], likeness: float = _SAME_WORD) -> str:
+    """Return the known field that is spelled nearly so, whatever its case; else ""."""
+    by_letters = {each.lower(): each for each in known}
+    near = get_close_matches(name.lower(), by_letters, 1, likeness)
+    return by_letters[near[0]] if near else ""
 
 
 def _is_of_kind(value: Any, type_name: str) -> bool:

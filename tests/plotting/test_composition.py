@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 import sqlite3
+from dataclasses import replace
 from itertools import pairwise
 from typing import Any
 
@@ -21,7 +22,7 @@ from webots_mcp.plotting.curves import MOST_CURVES, Curve, by_scale, by_signal
 from webots_mcp.plotting.intervals import Interval, at_resolution
 from webots_mcp.plotting.robot_path import PathPoint, RobotPath, headings, thinned
 from webots_mcp.plotting.signal_plot import SignalAxes, compose_signals
-from webots_mcp.plotting.trajectory import compose_trajectory
+from webots_mcp.plotting.trajectory import compose_trajectory, paint_trajectory
 from webots_mcp.store.chunk_making import chunk_whole_run
 
 
@@ -273,6 +274,18 @@ def test_what_was_not_read_in_time_is_hatched_and_is_no_end(
         last_s = path.places[-1].time_s
         assert path.is_whole == (last_s == pytest.approx(199.9))
         assert (f"The path of run 1 was not read after {last_s:g} s" in notes) != path.is_whole
+
+
+@pytest.mark.parametrize("room_m", [0.5, 6.0])
+@pytest.mark.parametrize("size_px", [(700, 400), (330, 330), (300, 800)])
+def test_a_robot_that_is_drawn_anywhere_on_its_path_is_inside_the_map(
+    rover: sqlite3.Connection, room_m: float, size_px: tuple[int, int]
+) -> None:
+    axes, _ = compose_trajectory(rover, [whole(rover)])
+    _, box = paint_trajectory(replace(axes, room_m=room_m), *size_px)
+    for place in axes.places:
+        assert box.x[0] <= place.x - room_m <= place.x + room_m <= box.x[1]
+        assert box.y[0] <= place.y - room_m <= place.y + room_m <= box.y[1]
 
 
 @pytest.mark.parametrize("compose", [compose_signals, compose_trajectory])

@@ -319,13 +319,18 @@ class Obstacle:
 
 @dataclass(frozen=True)
 class TrajectoryAxes:
-    """What is to be painted."""
+    """What is to be painted.
+
+    Attributes:
+        room_m: Room around the paths, for a robot that is drawn on them.
+    """
 
     title: str
     x_label: str
     y_label: str
     tracks: Sequence[PlottedPath]
     mode: str | None
+    room_m: float = 0.0
 
     @property
     def places(self) -> Sequence[PathPoint]:
@@ -389,7 +394,7 @@ class _TrajectoryPainter:
         """Return the same scale on both axes; a robot that stands still is not blown up."""
         canvas, places = self._canvas, self._plot.places
         low, high = ([pick(p[i] for p in places) for i in (1, 2)] for pick in (min, max))
-        sides = [max(b - a, _LAYOUT.min_size) * (1 + 2 * _LAYOUT.margin)
+        sides = [max(b - a, _LAYOUT.min_size) * (1 + 2 * _LAYOUT.margin) + 2 * self._plot.room_m
                  for a, b in zip(low, high, strict=True)]  # fmt: skip
         middle = [(a + b) / 2 for a, b in zip(low, high, strict=True)]
         labels = [text for _, text in ticks(*axis_range(low[1], high[1]), 8)]

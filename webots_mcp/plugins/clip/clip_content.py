@@ -274,7 +274,9 @@ def _track(
     headings = _headings(connection, whole, times, x, y, deadline_s)
     obstacles = obstacles_of(connection, [whole])
     outline = robot_outline(connection, whole)
-    axes = replace(axes, title=f"{whole.robot}, run {whole.segments[0].run_id}")
+    reach_m = max((math.hypot(*corner) for corner in outline), default=0.0)
+    title = f"{whole.robot}, run {whole.segments[0].run_id}"
+    axes = replace(axes, title=title, room_m=reach_m)
     return RobotTrack(axes, obstacles, times, x, y, headings, outline), ""
 
 

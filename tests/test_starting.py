@@ -136,5 +136,7 @@ folder = Path({str(tmp_path)!r})
 print(len(anyio.run(create_server(folder / "webots.db", folder, tools="all").list_tools)))
 """
     loaded = loaded_by(program)
-    assert "webots_mcp.questions.lint_world" in loaded
+    assert "webots_mcp.server.tool_list" in loaded
     assert not loaded & _OF_SINGLE_TOOLS
+    assert not loaded & {"webots_mcp.questions.declaration", "webots_mcp.answers.answer_models"}
+    assert "webots_mcp.judging" not in loaded

@@ -17,6 +17,9 @@ APPLICATION_ID: Final = 0x57424D43  # "WBMC", shown by the `file` command
 PREVIOUS_SCHEMA_VERSION: Final = 10  # of recordings that `webots-mcp import` brings over
 SCHEMA_VERSION: Final = 11  # PRAGMA user_version of a database that this version reads and writes
 
+ToolTier = Literal["core", "default", "all"]  # lists of tools: each has those of the one before
+TOOL_TIERS: Final[tuple[ToolTier, ...]] = get_args(ToolTier)
+
 DATABASE_NAME: Final = "webots.db"
 WORLD_ENDING: Final = ".wbt"
 WORLD_FOLDER: Final = "worlds"  # of a Webots project

@@ -20,8 +20,8 @@ from tests.golden.stored import drawn
 from tests.tool_list import counts_of
 from webots_mcp.answers.budget import ANSWER_TOKENS, LARGE_ANSWER_TOKENS
 from webots_mcp.answers.shortening import tokens_in
+from webots_mcp.contract import TOOL_TIERS
 from webots_mcp.database.location import MemoryDatabase
-from webots_mcp.questions.declaration import TIERS
 from webots_mcp.server.mcp_server import create_server
 
 _KILLS: Final = 200  # of each kind with a server
@@ -77,8 +77,8 @@ def answers(bench: Bench) -> Iterator[str]:
                 told.setdefault(TOOLS[asked][0], []).append(tokens)
     every = [tokens for each in told.values() for tokens in each]
     memory = MemoryDatabase()
-    server = {tier: create_server(memory, memory.data_dir, tools=tier) for tier in TIERS}
-    core, whole, _ = (counts_of(anyio.run(server[tier].list_tools)) for tier in TIERS)
+    server = {tier: create_server(memory, memory.data_dir, tools=tier) for tier in TOOL_TIERS}
+    core, whole, _ = (counts_of(anyio.run(server[tier].list_tools)) for tier in TOOL_TIERS)
     memory.close()
     yield (
         f"Half of {len(every)} answers have at most {median(every):,.0f} tokens, the list of the "

@@ -33,8 +33,8 @@ from tests.evaluations.scores import (
     summary,
 )
 from tests.tool_list import counts_of
+from webots_mcp.contract import TOOL_TIERS
 from webots_mcp.database.location import MemoryDatabase
-from webots_mcp.questions.declaration import TIERS
 from webots_mcp.server.mcp_server import create_server
 
 
@@ -110,7 +110,7 @@ def _line(outcome: Outcome) -> str:
 
 
 def _print_tool_lists() -> None:
-    for tier in TIERS:
+    for tier in TOOL_TIERS:
         memory = MemoryDatabase()
         counts = counts_of(anyio.run(create_server(memory, memory.data_dir, tools=tier).list_tools))
         memory.close()

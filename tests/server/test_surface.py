@@ -13,9 +13,10 @@ from mcp import Client, StdioServerParameters
 
 from tests.recordings.rows import Recorded
 from tests.server.conftest import Connect, ask, fail
-from tests.tool_list import counts_of
+from tests.tool_list import counts_of, made_anew
 from webots_mcp.cli import server_commands
-from webots_mcp.questions.declaration import Tier
+from webots_mcp.contract import ToolTier
+from webots_mcp.server.tool_list import FILE
 
 pytestmark = pytest.mark.anyio
 
@@ -68,7 +69,7 @@ def same(answer: Any) -> Any:
 
 @pytest.mark.parametrize(("tools", "names"), [("core", CORE), ("default", DEFAULT), ("all", ALL)])
 async def test_exactly_the_named_tools_are_listed(
-    connect: Connect, tools: Tier, names: set[str]
+    connect: Connect, tools: ToolTier, names: set[str]
 ) -> None:
     async with connect(tools=tools) as client:
         assert {tool.name for tool in (await client.list_tools()).tools} == names
@@ -76,7 +77,7 @@ async def test_exactly_the_named_tools_are_listed(
 
 @pytest.mark.parametrize("tools", ["core", "default", "all"])
 async def test_no_description_names_a_tool_that_is_not_listed(
-    connect: Connect, tools: Tier
+    connect: Connect, tools: ToolTier
 ) -> None:
     async with connect(tools=tools) as client:
         listed = (await client.list_tools()).tools
@@ -86,6 +87,19 @@ async def test_no_description_names_a_tool_that_is_not_listed(
         assert set(re.findall(r"webots_[a-z_]+", tool.description)) <= names, tool.name
         assert re.fullmatch(r"[A-Z].*\.", tool.description, re.DOTALL), tool.name
         assert not re.search(r"[;.] *[.;]", tool.description.replace("...", "")), tool.name
+
+
+def test_the_stored_list_is_what_the_questions_declare() -> None:
+    assert FILE.read_text("utf-8") == made_anew(), "run: python -m tests.tool_list --write"
+
+
+@pytest.mark.parametrize("asked", [False, True])
+async def test_listed_tools_have_the_schema_of_their_answers_where_that_is_asked_for(
+    connect: Connect, asked: bool
+) -> None:
+    async with connect(output_schemas=asked) as client:
+        for tool in (await client.list_tools()).tools:
+            assert (tool.output_schema is not None) == asked, tool.name
 
 
 async def test_a_server_that_only_reads_lists_no_tool_that_changes_anything(
@@ -104,7 +118,9 @@ async def test_the_help_of_serve_says_how_many_tools_a_list_has() -> None:
 @pytest.mark.parametrize(
     ("tools", "count", "tokens"), [("core", 20, 5_000), ("default", 34, 9_000)]
 )
-async def test_the_list_is_short(connect: Connect, tools: Tier, count: int, tokens: int) -> None:
+async def test_the_list_is_short(
+    connect: Connect, tools: ToolTier, count: int, tokens: int
+) -> None:
     async with connect(tools=tools) as client:
         listed = await client.list_tools()
     counted = counts_of(listed.tools)

@@ -7,10 +7,12 @@ publishes them as tools and the command line as commands; nothing else imports t
 from __future__ import annotations
 
 import importlib
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from webots_mcp.extras.plugin_registry import question_modules
-from webots_mcp.questions.declaration import Question
+
+if TYPE_CHECKING:
+    from webots_mcp.questions.declaration import Question
 
 # In the order in which clients list them; those of plugins follow.
 MODULES: Final = (
@@ -24,6 +26,8 @@ MODULES: Final = (
 
 def all_questions() -> list[Question]:
     """Return every question there is, once; a module may use those of others."""
+    from webots_mcp.questions.declaration import Question
+
     modules = [importlib.import_module(f"{__name__}.{name}") for name in MODULES]
     found = (each for module in [*modules, *question_modules()] for each in vars(module).values())
     return list(dict.fromkeys(each for each in found if isinstance(each, Question)))

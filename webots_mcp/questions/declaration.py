@@ -17,9 +17,7 @@ from typing import (
     TYPE_CHECKING,
     Any,
     Final,
-    Literal,
     NamedTuple,
-    get_args,
     get_type_hints,
 )
 
@@ -34,6 +32,7 @@ from pydantic.fields import FieldInfo
 from webots_mcp.answers.answer_models import Answer, ShownPicture
 from webots_mcp.answers.shortening import Client, compact_json, reader
 from webots_mcp.answers.summaries import summary_of
+from webots_mcp.contract import ToolTier
 from webots_mcp.errors import (
     MalformedRowError,
     NoDatabaseError,
@@ -51,8 +50,6 @@ if TYPE_CHECKING:
     from webots_mcp.steering.launcher import Companions
 
 Report = Callable[[float, float | None, str], Awaitable[None]]
-Tier = Literal["core", "default", "all"]
-TIERS: Final = get_args(Tier)
 
 
 @dataclass(frozen=True)
@@ -132,7 +129,7 @@ class Question:
     command: str | None = None
     positional: tuple[str, ...] = ()
     options: Mapping[str, str] | None = None
-    tier: Tier = "default"
+    tier: ToolTier = "default"
     follows: str | None = None
     example: str | None = None
     quotes: bool = False
@@ -294,7 +291,7 @@ def question(
     command: str | None = None,
     positional: tuple[str, ...] = (),
     options: Mapping[str, str] | None = None,
-    tier: Tier = "default",
+    tier: ToolTier = "default",
     follows: str | None = None,
     example: str | None = None,
     quotes: bool = False,

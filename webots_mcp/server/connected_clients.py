@@ -13,7 +13,10 @@ from typing import Any, Final
 import anyio
 from mcp.server.connection import Connection
 from mcp.server.context import CallNext, HandlerResult, ServerRequestContext
+from mcp.server.mcpserver import Context
 from mcp_types.version import MODERN_PROTOCOL_VERSIONS
+
+from webots_mcp.store.requests import Requester
 
 
 @dataclass(frozen=True)
@@ -85,3 +88,11 @@ def connection_of(ctx: ServerRequestContext[Any, Any]) -> Connection:
 async def _send(connection: Connection, method: str, params: Mapping[str, Any]) -> None:
     with anyio.move_on_after(_LIMITS.send_timeout_s):
         await connection.notify(method, dict(params))
+
+
+def requester_of(ctx: Context[Any]) -> Requester:
+    """Return the client, as it has named itself, and the transport that its call came by."""
+    asked = ctx.request_context
+    client = asked.session.client_params
+    name, version = (client.client_info.name, client.client_info.version) if client else ("", "")
+    return Requester(name, version, "stdio" if asked.request is None else "http")

@@ -8,7 +8,7 @@ interim result and make the call again with the answer. Without elicitation the 
 from __future__ import annotations
 
 from collections.abc import Awaitable, Callable, Mapping
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import anyio
 from mcp import MCPError
@@ -23,9 +23,11 @@ from mcp_types.version import MODERN_PROTOCOL_VERSIONS
 from pydantic import BaseModel
 
 from webots_mcp.errors import ConsentRequiredError, NotAllowedError
-from webots_mcp.questions.declaration import Reply
 from webots_mcp.store.recording import RecordingAccess
 from webots_mcp.store.requests import Consent, note_answer, recorded_arguments
+
+if TYPE_CHECKING:
+    from webots_mcp.questions.declaration import Reply
 
 ASK_TIMEOUT_S: Final = 90.0  # clients put a call aside, or give it up, after two minutes
 MOST_QUESTIONS: Final = 5  # of one call: each is of another rule

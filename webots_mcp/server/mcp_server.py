@@ -5,10 +5,10 @@ While it runs, it maintains the recording and follows the console of each Webots
 
 from __future__ import annotations
 
-import functools
 import threading
-from collections.abc import AsyncGenerator, Callable, Collection, Mapping
+from collections.abc import AsyncGenerator, Callable, Collection, Sequence
 from contextlib import AbstractAsyncContextManager, asynccontextmanager, closing
+from dataclasses import dataclass
 from pathlib import Path
 from sqlite3 import Connection
 from typing import Any, Final
@@ -26,18 +26,17 @@ from mcp.types import (
     GetPromptResult,
     InputRequiredResult,
 )
+from mcp.types import Tool as ToolEntry
 from pydantic import ValidationError
 
-from webots_mcp.contract import VERSION
+from webots_mcp.contract import TOOL_TIERS, VERSION, ToolTier
 from webots_mcp.database.connection import connect
 from webots_mcp.database.location import Database, MemoryDatabase
 from webots_mcp.database.maintenance import Maintainer
 from webots_mcp.database.schema import create_schema
 from webots_mcp.database.session_cleanup import reap_if_dead
 from webots_mcp.errors import InvalidInputError, NoDatabaseError, WebotsMCPError, warn
-from webots_mcp.questions import all_questions
 from webots_mcp.questions.argument_errors import faults_of, shown_value
-from webots_mcp.questions.declaration import TIERS, Tier
 from webots_mcp.questions.renamed_tools import current_call
 from webots_mcp.server.channel_notifications import CHANNEL_INSTRUCTIONS, Channel
 from webots_mcp.server.connected_clients import ConnectedClients
@@ -46,7 +45,7 @@ from webots_mcp.server.notable_events import OccurrenceReader
 from webots_mcp.server.prompts import add_prompts
 from webots_mcp.server.push_updates import UpdateWatch
 from webots_mcp.server.run_resources import Subscriptions, add_run_resources
-from webots_mcp.server.tools import tool_of
+from webots_mcp.server.tool_list import ListedTool, listed_tools
 from webots_mcp.signals.naming import perhaps_meant
 from webots_mcp.simulator.console import ConsoleWatch
 from webots_mcp.steering.launcher import Companions, Launcher
@@ -88,7 +87,7 @@ def create_server(
     data_dir: Path,
     *,
     read_only: bool = False,
-    tools: Tier = "default",
+    tools: ToolTier = "default",
     output_schemas: bool = False,
     limits: Asked | None = None,
     notify: bool = False,
@@ -109,8 +108,8 @@ def create_server(
     asked = dict(limits or {})
     connections = OpenConnections()
     recording = RecordingAccess(database, data_dir, read_only, asked, connections=connections)
-    possible = [each for each in all_questions() if each.effect.reads or not read_only]
-    shown = [each for each in possible if TIERS.index(each.tier) <= TIERS.index(tools)]
+    possible = [each for each in listed_tools() if each.reads or not read_only]
+    shown = [each for each in possible if TOOL_TIERS.index(each.tier) <= TOOL_TIERS.index(tools)]
     names = {each.name for each in shown}
     clients = ConnectedClients()
     channels = [Channel(clients)] if notify else []
@@ -125,15 +124,8 @@ def create_server(
         middleware=[clients, subscriptions, name_the_view, *channels],
         extensions=[make_view()],
         subscriptions=bus,
-        tools=[
-            tool_of(each, recording, listed=names, output_schema=output_schemas) for each in shown
-        ],
-        unlisted={
-            each.name: functools.partial(tool_of, each, recording)
-            for each in possible
-            if each not in shown
-        },
-        withheld={each.name for each in all_questions()} - {each.name for each in possible},
+        ours=[_OurTool(each, recording, names, output_schemas) for each in possible],
+        withheld={each.name for each in listed_tools() if each not in possible},
         cache_hints={"tools/list": _KEPT, "prompts/list": _KEPT, "resources/list": _KEPT},
         lifespan=_lifespan(recording, connections, Upkeep(data_dir), asked, watch, notify),
     )
@@ -248,19 +240,59 @@ def _schema_to_come() -> str:
     return text
 
 
+@dataclass(frozen=True)
+class _OurTool:
+    """A tool of a server, which is made when it is called.
+
+    Attributes:
+        shown: The names of the tools that the server lists.
+        has_output_schema: Whether its entry in the list has the schema of its answers.
+    """
+
+    listed: ListedTool
+    recording: RecordingAccess
+    shown: Collection[str]
+    has_output_schema: bool
+
+    @property
+    def is_shown(self) -> bool:
+        return self.listed.name in self.shown
+
+    def entry(self) -> ToolEntry:
+        """Return its entry in the list of tools."""
+        entry = self.listed.beside(self.shown)
+        if self.has_output_schema:
+            entry.output_schema = self.made().output_schema
+        return entry
+
+    def made(self) -> Tool:
+        """Return the tool itself."""
+        from webots_mcp.server.tools import tool_of
+
+        has_schema = self.has_output_schema and self.is_shown
+        return tool_of(self.listed.question, self.recording, output_schema=has_schema)
+
+
 class ToolServer(MCPServer):
-    """A server that answers to more names than it lists: other tools, and former names of tools."""
+    """A server whose tools are made when they are called.
+
+    It answers to more names than it lists: other tools, and former names of tools.
+    """
 
     def __init__(
         self,
         *arguments: Any,
-        unlisted: Mapping[str, Callable[[], Tool]],
+        ours: Sequence[_OurTool],
         withheld: Collection[str],
         **options: Any,
     ) -> None:
         super().__init__(*arguments, **options)
-        self._unlisted = unlisted
+        self._ours = {each.listed.name: each for each in ours}
         self._withheld = withheld
+
+    async def list_tools(self) -> list[ToolEntry]:
+        """Return the tools that are listed."""
+        return [each.entry() for each in self._ours.values() if each.is_shown]
 
     async def call_tool(
         self, name: str, arguments: dict[str, Any], context: Context[Any, Any] | None = None
@@ -279,19 +311,14 @@ class ToolServer(MCPServer):
                 f"{name} changes the simulation or the recording, and this server is --read-only. "
                 "To use it, restart the server without --read-only."
             )
-        if self._tool_manager.get_tool(name) is None:
-            make = self._unlisted.get(name)
-            if make is None:
-                raise ToolError(self._unknown(name))
-            context = context or Context(mcp_server=self)
-            return await make().run(arguments, context, convert_result=True)
-        return await super().call_tool(name, arguments, context)
+        if name not in self._ours:
+            raise ToolError(self._unknown(name))
+        context = context or Context(mcp_server=self)
+        return await self._ours[name].made().run(arguments, context, convert_result=True)
 
     def _unknown(self, name: str) -> str:
         """There is no such tool, and which one was perhaps meant."""
-        listed = [tool.name for tool in self._tool_manager.list_tools()]
-        known = {*listed, *self._unlisted} - {*self._withheld}
-        bare = (each.removeprefix(_TOOL_PREFIX) for each in sorted(known))
+        bare = (each.removeprefix(_TOOL_PREFIX) for each in sorted(self._ours))
         near = perhaps_meant(name.lower().removeprefix(_TOOL_PREFIX), bare)
         meant = " or ".join(f"{_TOOL_PREFIX}{each}" for each in near)
         offer = f"Did you mean {meant}?" if meant else "tools/list names all tools."

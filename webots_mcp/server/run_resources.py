@@ -7,7 +7,7 @@ ones listen; both receive only the address, and read it again.
 from __future__ import annotations
 
 import re
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from anyio import CapacityLimiter, to_thread
 from mcp import MCPError
@@ -23,16 +23,16 @@ from mcp.types import (
     UnsubscribeRequestParams,
 )
 
-from webots_mcp.answers.answer_models import ShownPicture
 from webots_mcp.answers.shortening import compact_json
 from webots_mcp.errors import NothingRecordedError, UnknownRunError, WebotsMCPError
-from webots_mcp.questions import all_questions
-from webots_mcp.questions.declaration import Caller, Reply
-from webots_mcp.server.connected_clients import ConnectedClients, connection_of
+from webots_mcp.server.connected_clients import ConnectedClients, connection_of, requester_of
 from webots_mcp.server.notable_events import IS_DATA, News
 from webots_mcp.server.push_updates import UpdateWatch
-from webots_mcp.server.tools import requester_of
+from webots_mcp.server.tool_list import listed_tools
 from webots_mcp.store.recording import RecordingAccess
+
+if TYPE_CHECKING:
+    from webots_mcp.questions.declaration import Reply
 
 REPORT_URI: Final = "webots://run/{run_id}/report"
 PLOT_URI: Final = "webots://run/{run_id}/plot"
@@ -47,9 +47,11 @@ def add_run_resources(mcp: MCPServer, recording: RecordingAccess) -> None:
     at_once: list[CapacityLimiter] = []  # which belongs to the event loop
 
     async def ask(tool: str, run_id: int, ctx: Context[Any]) -> Reply:
+        from webots_mcp.questions.declaration import Caller
+
         if not at_once:
             at_once.append(CapacityLimiter(_AT_ONCE))
-        question = next(each for each in all_questions() if each.name == tool)
+        question = next(each.question for each in listed_tools() if each.name == tool)
         companions = ctx.request_context.lifespan_context
         caller = Caller("mcp", ctx.report_progress, companions, requester_of(ctx))
         async with at_once[0]:
@@ -75,10 +77,10 @@ def add_run_resources(mcp: MCPServer, recording: RecordingAccess) -> None:
     )  # fmt: skip
     async def plot(run_id: int, ctx: Context[Any]) -> bytes:
         reply = await ask("webots_plot", run_id, ctx)
-        picture = next((each for each in reply.shown if isinstance(each, ShownPicture)), None)
-        if picture is None:
-            raise ResourceError(f"run {run_id} has nothing that could be drawn")
-        return picture.data
+        for each in reply.shown:
+            if not isinstance(each, str):
+                return each.data
+        raise ResourceError(f"run {run_id} has nothing that could be drawn")
 
     _ = report, plot  # registered by their decorators
 

@@ -9,8 +9,7 @@ from __future__ import annotations
 import functools
 import inspect
 import logging
-import re
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 from typing import Any, Final
 
 from mcp import MCPError
@@ -29,58 +28,26 @@ from webots_mcp.answers.answer_models import ShownPicture
 from webots_mcp.answers.shortening import cut_text
 from webots_mcp.errors import WebotsMCPError
 from webots_mcp.questions.declaration import Caller, Question, Reply
+from webots_mcp.server.connected_clients import requester_of
 from webots_mcp.server.consent import ask_with_consent
 from webots_mcp.server.freed_memory import give_back
 from webots_mcp.server.tool_arguments import CheckedTool
 from webots_mcp.store.recording import RecordingAccess
-from webots_mcp.store.requests import Requester
 
-_TOOL_NAME: Final = re.compile(r"\bwebots_[a-z_]+\b")
 _CONTEXT: Final = Context[Any]  # evaluated once: it takes as long as declaring an argument
 _log = logging.getLogger(__name__)
 
 
-def tool_of(
-    question: Question,
-    recording: RecordingAccess,
-    *,
-    listed: Collection[str] | None = None,
-    output_schema: bool = False,
-) -> Tool:
+def tool_of(question: Question, recording: RecordingAccess, *, output_schema: bool = False) -> Tool:
     """Return a question as a tool; its schemas, which take milliseconds, are made once.
 
     Args:
         question: The question.
         recording: What it is asked of.
-        listed: The tools of the list that it belongs to. Its description names no other one,
-            because a model cannot call what its client does not list. None keeps all names.
         output_schema: Whether it has the schema of its answers.
     """
     tool = _tool(question, output_schema)
-    changes: dict[str, Any] = {"fn": functools.partial(tool.fn, recording)}
-    if listed is not None:
-        changes["description"] = naming_only(listed, tool.description or "")
-    return tool.model_copy(update=changes)
-
-
-def naming_only(listed: Collection[str], text: str) -> str:
-    """Return a description without the clauses that name tools that are not listed."""
-    return "\n\n".join(
-        kept for part in text.split("\n\n") if (kept := _clauses_naming_only(listed, part))
-    )
-
-
-def _clauses_naming_only(listed: Collection[str], text: str) -> str:
-    kept = ""
-    for clause in re.split(r"(?<=[.;]) +", " ".join(text.split())):
-        if not set(_TOOL_NAME.findall(clause)) <= set(listed):
-            if clause.endswith(".") and kept.endswith(";"):
-                kept = f"{kept[:-1]}."
-            continue
-        begins = not kept or kept.endswith(".")
-        is_word = begins and not _TOOL_NAME.match(clause)
-        kept += (" " if kept else "") + (clause[0].upper() + clause[1:] if is_word else clause)
-    return f"{kept[:-1]}." if kept.endswith(";") else kept
+    return tool.model_copy(update={"fn": functools.partial(tool.fn, recording)})
 
 
 @functools.cache
@@ -132,14 +99,6 @@ def _answering(question: Question) -> Callable[..., Any]:
     vars(wrapper)["__signature__"] = question.signature.replace(parameters=[*own, context])
     wrapper.__annotations__ = {"ctx": _CONTEXT}
     return wrapper
-
-
-def requester_of(ctx: Context[Any]) -> Requester:
-    """Return the client, as it has named itself, and the transport that its call came by."""
-    asked = ctx.request_context
-    client = asked.session.client_params
-    name, version = (client.client_info.name, client.client_info.version) if client else ("", "")
-    return Requester(name, version, "stdio" if asked.request is None else "http")
 
 
 def _as_result(reply: Reply) -> CallToolResult:

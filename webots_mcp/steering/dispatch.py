@@ -12,21 +12,22 @@ import time
 from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import anyio
 from anyio import to_thread
 
-from webots_mcp.answers.answer_models import CommandAnswer
 from webots_mcp.contract import LOOPING
 from webots_mcp.database.queue import CommandQueue, QueuedCommand, fetch_command
-from webots_mcp.steering.command_answer import command_answer, correct_mode
 from webots_mcp.steering.run_command import ACTION, describe_progress
 from webots_mcp.steering.target_robot import find_target, require_parameters
 from webots_mcp.store.recording import RecordingAccess, view_robot
 from webots_mcp.store.requests import permit
 from webots_mcp.store.robot_status import BlockedLoop, find_block
 from webots_mcp.store.robots import robot_name
+
+if TYPE_CHECKING:
+    from webots_mcp.answers.answer_models import CommandAnswer
 
 # Receives how much is done, how much there is to do (None if unknown), and a text.
 ProgressReport = Callable[[float, float | None, str], Awaitable[None]]
@@ -117,6 +118,8 @@ class Dispatcher:
         """Correct the mode in an answer, since a later command may have changed it."""
 
         def correct(command_id: int) -> None:
+            from webots_mcp.steering.command_answer import correct_mode
+
             with self._recording.reader() as connection:
                 command = fetch_command(connection, command_id)
                 view = view_robot(connection, robot_name(connection, command.robot_id))
@@ -240,6 +243,9 @@ class Dispatcher:
             return fetch_command(connection, command_id)
 
     def _answer(self, command: QueuedCommand, waited_s: float) -> CommandAnswer:
+        # Imported with the first command: a server that starts needs none of it.
+        from webots_mcp.steering.command_answer import command_answer
+
         with self._recording.reader() as connection:
             view = view_robot(connection, robot_name(connection, command.robot_id))
             return command_answer(view, command, waited_s)

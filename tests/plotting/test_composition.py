@@ -19,9 +19,9 @@ from webots_mcp.errors import NothingRecordedError
 from webots_mcp.plotting.canvas import MOST_PANELS, Sheet
 from webots_mcp.plotting.colours import MERGED, MOST_VALUES, OTHER_VALUES, area_styles
 from webots_mcp.plotting.curves import MOST_CURVES, Curve, by_scale, by_signal
-from webots_mcp.plotting.intervals import Interval, at_resolution
+from webots_mcp.plotting.intervals import Interval, Lane, at_resolution
 from webots_mcp.plotting.robot_path import PathPoint, RobotPath, headings, thinned
-from webots_mcp.plotting.signal_plot import SignalAxes, compose_signals
+from webots_mcp.plotting.signal_plot import SignalAxes, compose_signals, paint_signals
 from webots_mcp.plotting.trajectory import compose_trajectory, paint_trajectory
 from webots_mcp.store.chunk_making import chunk_whole_run
 
@@ -274,6 +274,16 @@ def test_what_was_not_read_in_time_is_hatched_and_is_no_end(
         last_s = path.places[-1].time_s
         assert path.is_whole == (last_s == pytest.approx(199.9))
         assert (f"The path of run 1 was not read after {last_s:g} s" in notes) != path.is_whole
+
+
+@pytest.mark.parametrize(("events", "lines"), [(1, 1), (30, 30), (31, 0)])
+def test_events_are_marked_through_the_panels_all_or_none(
+    rover: sqlite3.Connection, events: int, lines: int
+) -> None:
+    axes, _ = compose_signals(rover, [whole(rover)], ["pose.0"])
+    lane = Lane("jump", [Interval("", float(at), float(at)) for at in range(events)], [])
+    canvas, _ = paint_signals(replace(axes, events=[lane]), 900, 500)
+    assert canvas.svg().count('stroke-dasharray="1 3"') == lines
 
 
 @pytest.mark.parametrize("room_m", [0.5, 6.0])

@@ -460,9 +460,9 @@ class _SignalPainter:
         self._open(frame)
         self._ground(frame)
         paint_grid(canvas, frame, (), levels)
-        for event in [each for lane in self._plot.events for each in lane.intervals][
-            : _LAYOUT.event_lines
-        ]:
+        starts = [each for lane in self._plot.events for each in lane.intervals]
+        # Lines of the first ones only would look as if there were no others.
+        for event in starts if len(starts) <= _LAYOUT.event_lines else ():
             x = float(frame.px(event.start_s))
             pen = {"stroke": canvas.theme.faint, "stroke_width": 0.6, "stroke_dasharray": "1 3"}
             canvas.add("path", d=f"M{x:.1f} {frame.top:.1f}V{frame.bottom:.1f}", **pen)
@@ -553,9 +553,12 @@ class _SignalPainter:
     def _ground(self, frame: AxesBox) -> None:
         """Modes and gaps, over the whole height behind the curves."""
         bands = self._plot.bands
+        # A thousand bands are drawn in half the time where their edges are those of pixels.
+        self._canvas.open(shape_rendering="crispEdges")
         for each in _shown(bands.intervals, frame) if bands else ():
             box = (*self._stretch(frame, each), frame.height)
             paint_area(self._canvas, self._styles[each.value], box, _LAYOUT.band_opacity)
+        self._canvas.close()
         self._hatch(frame)
 
     def _hatch(self, frame: AxesBox) -> None:

@@ -21,6 +21,16 @@ from webots_mcp.lint.scene import (
 from webots_mcp.lint.world_faults import LintReport, Severity, WorldFault
 from webots_mcp.worlds.vrml import FieldDefinition
 
+_MOST_LINES: Final = 5
+_SIMILAR: Final = 0.7  # likeness of what may be meant by a name that is wrong in any case
+_SAME_WORD: Final = 0.9  # likeness of a misspelt name: one letter in six may differ
+_NO_FIELDS: Final[Mapping[str, FieldDefinition]] = {}
+_TAKES: Final = {
+    "Bool": "TRUE or FALSE", "String": "a text in quotes", "Node": "a node or NULL",
+    **dict.fromkeys(("Float", "Int32"), "a number"),
+    **dict.fromkeys(("Vec2f", "Vec3f", "Rotation", "Color"), "numbers"),
+}  # fmt: skip
+
 
 @dataclass(frozen=True)
 class RenderingEstimate:
@@ -34,15 +44,6 @@ class RenderingEstimate:
 
 
 _RENDERING: Final = RenderingEstimate()
-_MOST_LINES: Final = 5
-_SIMILAR: Final = 0.7  # likeness of what may be meant by a name that is wrong in any case
-_SAME_WORD: Final = 0.9  # likeness of a misspelt name: one letter in six may differ
-_NO_FIELDS: Final[Mapping[str, FieldDefinition]] = {}
-_TAKES: Final = {
-    "Bool": "TRUE or FALSE", "String": "a text in quotes", "Node": "a node or NULL",
-    **dict.fromkeys(("Float", "Int32"), "a number"),
-    **dict.fromkeys(("Vec2f", "Vec3f", "Rotation", "Color"), "numbers"),
-}  # fmt: skip
 
 
 class WorldRules:

@@ -30,6 +30,16 @@ from webots_mcp.store.registered_signals import RegisteredSignal
 from webots_mcp.store.robots import RobotRecord
 from webots_mcp.store.runs import RunInfo, list_runs
 
+_RunKey = tuple[str, int, float]  # database, run, start: an id may come back with another database
+
+_log: Final = logging.getLogger(__name__)
+_NO_OUTCOME: Final = "not checked"  # of runs that were not checked yet, or cannot be
+_WORDS: Final = {"fail": "failed", "warn": "warned", "pass": "passed"}
+_OUTCOMES: Final[dict[_RunKey, str]] = {}
+# Runs are checked in the background, so that no request waits for a check.
+_CHECKING: Final = ThreadPoolExecutor(1, "webots-mcp outcomes")
+_KEEPING: Final = threading.Lock()
+
 
 @dataclass(frozen=True)
 class RunListLimits:
@@ -65,16 +75,7 @@ class RunCurve(NamedTuple):
 
 
 _NO_CURVE: Final = RunCurve(np.empty(0), np.empty(0))
-_RunKey = tuple[str, int, float]  # database, run, start: an id may come back with another database
-
-_log: Final = logging.getLogger(__name__)
-_NO_OUTCOME: Final = "not checked"  # of runs that were not checked yet, or cannot be
-_WORDS: Final = {"fail": "failed", "warn": "warned", "pass": "passed"}
-_OUTCOMES: Final[dict[_RunKey, str]] = {}
 _CURVES: Final[dict[tuple[_RunKey, str], RunCurve]] = {}
-_KEEPING: Final = threading.Lock()
-# Runs are checked in the background, so that no request waits for a check.
-_CHECKING: Final = ThreadPoolExecutor(1, "webots-mcp outcomes")
 
 
 def run_choices(recording: RecordingAccess, runs: Sequence[RunInfo]) -> list[dict[str, Any]]:

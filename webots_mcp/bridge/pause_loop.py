@@ -44,7 +44,8 @@ class Pause:
     runs there (a handler, a callback) may step nevertheless: time advances for just that step.
 
     Args:
-        before_pause: Called before a pause begins, since no call of the loop follows to write rows.
+        before_pause: Called before a pause begins, to write rows: the loop makes no call during the
+            pause.
         after_step: Called after each intercepted step, before the loop's own code runs.
 
     Attributes:
@@ -68,7 +69,7 @@ class Pause:
         self._after_step = after_step
         self._mode_before: str | None = None  # before a pause, a run's pace or steps; None without
         self._user_code_depth = 0  # a count: a handler may call get_command(), which runs another
-        self._awaiting_step = False
+        self._awaiting_reset = False
         self._ask_before_steps: Callable[[], object] | None = None
         self._step_listener: StepListener | None = None
         self.active = False
@@ -110,7 +111,7 @@ class Pause:
 
     @contextmanager
     def world_waits(self) -> Generator[None]:
-        """Let the world wait for this robot's steps meanwhile.
+        """Make the world wait for this robot's steps during the block.
 
         The heartbeat records it first: if the process is killed meanwhile, the next session lets
         the world continue (`set_world_free`).
@@ -122,7 +123,7 @@ class Pause:
             self._heartbeat.change_loop(STEPPING)
 
     def set_world_free(self) -> None:
-        """Let a world continue that the bridge of an ended process had made wait for its steps."""
+        """Release a world that an ended process left waiting for its steps."""
         if self._simulation.supervisor and self._simulation.set_world_free():
             self._journal.log("warning", "bridge", SET_FREE)
 
@@ -176,14 +177,14 @@ class Pause:
         return self._user_code_depth > 0
 
     @contextmanager
-    def awaiting_step(self) -> Generator[None]:
-        """Intercept steps while a reset is awaited: it is noticed before the loop's code runs."""
-        self._awaiting_step = True
+    def awaiting_reset(self) -> Generator[None]:
+        """Intercept steps while a reset is awaited, to see it before the loop's code runs."""
+        self._awaiting_reset = True
         self._guard_steps()
         try:
             yield
         finally:
-            self._awaiting_step = False
+            self._awaiting_reset = False
             self._guard_steps()
 
     @contextmanager
@@ -218,7 +219,7 @@ class Pause:
         Steps of a handler are intercepted outside a pause too: they show that the loop is alive.
         """
         asked = self._ask_before_steps is not None or self._step_listener is not None
-        needed = self.active or self.in_user_code or self._awaiting_step or asked
+        needed = self.active or self.in_user_code or self._awaiting_reset or asked
         self._simulation.guard_steps(self._on_step if needed else None)
 
     def _on_step(self, step: Step) -> int:

@@ -80,7 +80,8 @@ class WorldActions:
         self._simulation.robot.simulationReset()
         timeout_s = 10.0
         deadline_s = time.monotonic() + timeout_s
-        with self._pause.awaiting_step():  # the state published in the first step is of the new run
+        # The state that is published in the first step is of the new run.
+        with self._pause.awaiting_reset():
             while clock.run is run:
                 if time.monotonic() > deadline_s:
                     clock.forget_reset()

@@ -246,9 +246,9 @@ def _explain_value(error: Exception) -> str:
     """
     import traceback
 
-    from webots_mcp.store.recording import is_over_a_value
+    from webots_mcp.store.recording import is_invalid_value
 
-    if not is_over_a_value(error):
+    if not is_invalid_value(error):
         raise error
     frame, what = traceback.extract_tb(error.__traceback__)[-1], type(error).__name__
     return (

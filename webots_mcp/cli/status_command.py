@@ -23,7 +23,7 @@ from webots_mcp.cli.terminal import (
 from webots_mcp.store.reading.segment import shown_time
 
 _MOST_MODES: Final = 10  # robots whose mode is read: each takes a query
-_MOST_ROWS: Final = 5000  # of a run that are searched for the last change of the mode
+_MOST_ROWS: Final = 5000  # newest rows of a run in which the last change of `mode` is searched
 _MODES: Final = (
     "SELECT sim_time_s, data -> '$.mode' FROM state WHERE run_id = ? "
     "ORDER BY sim_time_s DESC, id DESC LIMIT ?"
@@ -82,9 +82,9 @@ def _rows_of(table: Mapping[str, Sequence[Any]]) -> list[dict[str, Any]]:
 
 
 def _without_mode(recorded: Where) -> frozenset[str]:
-    """Return the robots whose signals are known, with none called `mode` among them.
+    """Return the robots that have registered signals, but none named `mode`.
 
-    Reading a signal imports numpy, for which they need not wait.
+    Reading a signal imports numpy, so these robots are skipped.
     """
     with recorded.recording().reader() as connection:
         return frozenset(
@@ -106,10 +106,10 @@ def _mode_of(robot: Mapping[str, Any], recorded: Where) -> dict[str, Any]:
 
 
 def _mode_in_newest_rows(connection: sqlite3.Connection, run_id: int) -> dict[str, Any] | None:
-    """Return what `_mode_of` does where a few rows tell, without importing numpy; else None."""
+    """Return the mode and its start from the newest rows; None if these do not show it."""
     is_kept = "SELECT EXISTS (SELECT 1 FROM kept_stretch WHERE run_id = ?)"
     if connection.execute(is_kept, (run_id,)).fetchone()[0]:
-        return None  # rows of full rate may tell an earlier change
+        return None  # full-rate rows may show an earlier change
     last, since_s = None, 0.0
     try:
         rows = connection.execute(_MODES, (run_id, _MOST_ROWS))

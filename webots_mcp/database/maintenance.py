@@ -1,4 +1,7 @@
-"""Checkpoints, done by one process at a time and never in a control loop.
+"""Periodic work and checkpoints, done by one process at a time and never in a control loop.
+
+A `Maintainer` calls `work` once a second: a server makes chunks there, deletes what is too old,
+and ends the sessions of dead processes.
 
 The log of a WAL database grows until a checkpoint copies it back. An automatic checkpoint would
 be the slowest step of a control loop (5 ms at p99.9, measured), so the bridge's connection makes

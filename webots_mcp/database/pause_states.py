@@ -25,7 +25,7 @@ import math
 import sqlite3
 from typing import Final, NamedTuple
 
-PAUSED: Final = "paused"  # how a command controls the loop: the column session.pause_state
+PAUSED: Final = "paused"  # values of session.pause_state
 STEPPING: Final = "stepping"
 STEPPING_WORLD: Final = "stepping the world"  # which waits for this robot meanwhile
 PAUSE: Final = "pause"  # the kinds of the events
@@ -39,7 +39,7 @@ SET_FREE: Final = (
     "before this one ended in the middle of a step command, while the world waited for its steps"
 )
 
-# The texts of a status for a pause that no bridge has begun.
+# Texts with which a status says who paused the simulation.
 SEEN_PAUSED: Final = "paused in Webots, as robot"
 SEEN_RUNNING: Final = "not paused, as robot"
 SEEN_PAUSED_BY: Final = f"{SEEN_PAUSED} {{!r}} sees; webots_simulation_control('resume') resumes it"
@@ -71,7 +71,7 @@ class Cause(NamedTuple):
 
     @property
     def data(self) -> dict[str, object]:
-        """As the event has it."""
+        """Return the `data` of the event."""
         if self.condition is not None:
             return {"breakpoint_id": self.breakpoint_id, "condition": self.condition}
         return {"command_id": self.command_id} if self.by is None else {"by": self.by}

@@ -1,4 +1,4 @@
-"""Rules about the file: PROTO nodes, names, and what its sensors cost."""
+"""Rules about a world file: its fields, time step, PROTO nodes, equal names, cost of sensors."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ from webots_mcp.lint.world_faults import LintReport, Severity, WorldFault
 from webots_mcp.worlds.vrml import FieldDefinition
 
 _MOST_LINES: Final = 5
-_SIMILAR: Final = 0.7  # likeness of what may be meant by a name that is wrong in any case
-_SAME_WORD: Final = 0.9  # likeness of a misspelt name: one letter in six may differ
+_SIMILAR: Final = 0.7  # least similarity of a suggestion for a name that is certainly wrong
+_SAME_WORD: Final = 0.9  # least similarity at which an unknown name counts as misspelt
 _NO_FIELDS: Final[Mapping[str, FieldDefinition]] = {}
 _TAKES: Final = {
     "Bool": "TRUE or FALSE", "String": "a text in quotes", "Node": "a node or NULL",
@@ -86,7 +86,8 @@ class WorldRules:
     def _field_names(self) -> None:
         """Report fields that no PROTO declares, and misspelt fields of Webots' own nodes.
 
-        A field of Webots' own node that is like none of the known ones may be of another release.
+        A field of a Webots node that resembles no known field is not reported: it may belong to
+        another release.
         """
         for (file, line, name), (type_name, source) in self._scene.unknown_fields.items():
             near = _likely_meant(name, source.fields, _SIMILAR)
@@ -94,7 +95,7 @@ class WorldRules:
             self._report.faults.append(
                 WorldFault(
                     "file", "warning", f"{type_name}.{name}", file, line,
-                    f"{source.file.name} has no field {name}{has}: Webots ignores what is given",
+                    f"{source.file.name} has no field {name}{has}: Webots ignores its value",
                     f"Write {near}." if near else f"Remove {name}, or add it to the PROTO.",
                 )
             )  # fmt: skip
@@ -172,12 +173,14 @@ class WorldRules:
             families.setdefault(part.parent, []).append(part)
         for siblings in families.values():
             nodes = [part.node for part in siblings if not part.is_in_unread]
-            self._twice(nodes, "Solid")
+            self._report_equal(nodes, "Solid")
         for robot in self._scene.of_type("Robot"):
             devices = [node for node in _inside(robot) if node.type_name in DEVICES]
-            self._twice(devices, "device", robot)
+            self._report_equal(devices, "device", robot)
 
-    def _twice(self, nodes: Sequence[TreeNode], kind: str, robot: TreeNode | None = None) -> None:
+    def _report_equal(
+        self, nodes: Sequence[TreeNode], kind: str, robot: TreeNode | None = None
+    ) -> None:
         self._report.judge("names", len(nodes))
         counts = Counter(node.text("name") for node in nodes)
         for name, count in counts.items():
@@ -255,7 +258,7 @@ def _inside(node: TreeNode) -> list[TreeNode]:
 
 
 def _likely_meant(name: str, known: Iterable[str], likeness: float = _SAME_WORD) -> str:
-    """Return the known field that is spelled nearly so, whatever its case; else ""."""
+    """Return the known field that is spelled most alike, ignoring case; "" if none is similar."""
     by_letters = {each.lower(): each for each in known}
     near = get_close_matches(name.lower(), by_letters, 1, likeness)
     return by_letters[near[0]] if near else ""

@@ -1,6 +1,6 @@
 """The list of tools, read from a file, so that a server imports no question before it is asked.
 
-Making the list from the declared questions takes half as long as all else that a start does.
+Making the list from the questions would lengthen the start of a server by a quarter.
 `python -m tests.tool_list --write` makes the file `tool_list.json` from them, a tool on each line.
 """
 
@@ -31,9 +31,10 @@ class ListedTool(NamedTuple):
     Attributes:
         name: Its name.
         module: The module that declares its question.
-        tier: The shortest list that has it.
+        tier: The smallest tier that lists it.
         reads: Whether it changes nothing.
-        tool: What clients get of it, in JSON; its description may name any other tool.
+        tool: Its entry in the list, as JSON. The description may name tools that are not listed;
+            `entry_among` removes those.
     """
 
     name: str
@@ -44,10 +45,10 @@ class ListedTool(NamedTuple):
 
     @property
     def question(self) -> Question:
-        """Its question; its module is imported now."""
+        """Import its module and return its question."""
         return cast("Question", getattr(import_module(self.module), self.name))
 
-    def beside(self, listed: Collection[str]) -> Tool:
+    def entry_among(self, listed: Collection[str]) -> Tool:
         """Return the tool for a list with these tools: its description names no other one."""
         description = naming_only(listed, self.tool["description"])
         return Tool.model_validate(self.tool | {"description": description})
@@ -55,7 +56,7 @@ class ListedTool(NamedTuple):
 
 @cache
 def listed_tools() -> tuple[ListedTool, ...]:
-    """Return all tools, in the order in which clients list them."""
+    """Return all tools in the order of `questions.MODULES`; those of plugins follow."""
     return tuple(ListedTool(**each) for each in json.loads(FILE.read_text("utf-8")))
 
 

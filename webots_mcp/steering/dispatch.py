@@ -41,14 +41,14 @@ class WaitingTimes:
     """Times of waiting for a command, in wall seconds.
 
     Attributes:
-        poll_s: Between two reads of its row. A read by key takes microseconds, as
-            PRAGMA data_version does, which misses commits of the same connection.
-        soon_poll_s: The same as long as it waits for less than `soon_s`: a loop that runs answers
-            within a few of its steps.
+        poll_s: Between two reads of its row. PRAGMA data_version is no faster, and misses commits
+            of the same connection.
+        soon_poll_s: The same during the first `soon_s`: a loop that runs answers within a few
+            steps.
         soon_s: See `soon_poll_s`.
         report_s: Between two reports of progress.
         block_search_s: Between two searches for what blocks the loop.
-        outliving_s: How long an unclaimed command stays valid after the time limit. Usually the
+        expiry_margin_s: How long an unclaimed command stays valid after the time limit. Usually the
             server cancels it at that limit; if the server dies first, the command expires then.
     """
 
@@ -57,7 +57,7 @@ class WaitingTimes:
     soon_s: float = 0.1
     report_s: float = 1.0
     block_search_s: float = 0.25
-    outliving_s: float = 1.0
+    expiry_margin_s: float = 1.0
 
 
 _TIMES: Final = WaitingTimes()
@@ -114,7 +114,7 @@ class Dispatcher:
         waited_s = round(time.monotonic() - started_s, 3)
         return await to_thread.run_sync(self._answer, command, waited_s)
 
-    async def name_mode_afterwards(self, answer: CommandAnswer) -> None:
+    async def refresh_mode(self, answer: CommandAnswer) -> None:
         """Correct the mode in an answer, since a later command may have changed it."""
 
         def correct(command_id: int) -> None:
@@ -151,7 +151,7 @@ class Dispatcher:
         except (anyio.get_cancelled_exc_class(), KeyboardInterrupt):
             with anyio.CancelScope(shield=True):
                 if (sent := await to_thread.run_sync(sending.stop)) is not None:
-                    await to_thread.run_sync(self._leave, sent)
+                    await to_thread.run_sync(self._abandon, sent)
             raise
 
     async def _outcome(
@@ -168,7 +168,7 @@ class Dispatcher:
         except (anyio.get_cancelled_exc_class(), KeyboardInterrupt):
             # A KeyboardInterrupt is raised wherever the main thread is, which may be in this task.
             with anyio.CancelScope(shield=True):
-                await to_thread.run_sync(self._leave, command)
+                await to_thread.run_sync(self._abandon, command)
             raise
 
     def _enqueue(
@@ -183,7 +183,7 @@ class Dispatcher:
                 view.robot.id,
                 action,
                 params,
-                time_to_live_s=timeout_s + _TIMES.outliving_s,
+                time_to_live_s=timeout_s + _TIMES.expiry_margin_s,
                 requested_by=self._recording.asker,
                 request_id=request_id,
             )
@@ -228,7 +228,7 @@ class Dispatcher:
         withdraw_if_blocked(self._recording, command)
         return self._cancel(command.id, "no controller claimed it in time; it will not run")
 
-    def _leave(self, command: QueuedCommand) -> None:
+    def _abandon(self, command: QueuedCommand) -> None:
         """Cancel a command whose caller has left; a `run` or `step` that has begun ends now."""
         with self._recording.brief_writer() as connection:
             queue = CommandQueue(connection)

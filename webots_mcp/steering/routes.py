@@ -219,7 +219,7 @@ class Attempt(Request):
         if self.order not in ("pause", "step"):
             answer.evidence = await self._await_evidence(situation, _EVIDENCE_S)
             answer.hint = answer.hint if answer.evidence else _NOT_SHOWN
-            await self.dispatcher.name_mode_afterwards(answer)
+            await self.dispatcher.refresh_mode(answer)
         return answer
 
     def _with_failed_routes(self, answer: CommandAnswer) -> CommandAnswer:

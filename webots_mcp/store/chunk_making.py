@@ -47,7 +47,7 @@ from webots_mcp.store.chunks import (
     statistics_of,
     watermark,
 )
-from webots_mcp.store.recording import RecordingAccess, is_over_a_value
+from webots_mcp.store.recording import RecordingAccess, is_invalid_value
 from webots_mcp.store.registered_signals import (
     RegisteredSignal,
     enter_signals,
@@ -464,7 +464,7 @@ def _read(connection: sqlite3.Connection, query: str, values: tuple[object, ...]
         columns.add(rows)
     except Exception as error:
         valid = [row for row in rows if _is_valid(row)]
-        if not is_over_a_value(error) or len(valid) == len(rows):
+        if not is_invalid_value(error) or len(valid) == len(rows):
             raise
         columns = StateColumns()
         columns.add(valid)
@@ -480,7 +480,7 @@ def _is_valid(row: tuple[Any, ...]) -> bool:
     try:
         StateColumns().add([row])
     except Exception as error:
-        if not is_over_a_value(error):
+        if not is_invalid_value(error):
             raise
         return False
     return True

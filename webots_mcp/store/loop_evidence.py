@@ -60,9 +60,9 @@ class _LoopLimits:
     """When the loop of a controller counts as silent or slow.
 
     Attributes:
-        still_moving_s: Minimum age of the last movement at which time counts as stopped.
+        still_moving_s: Maximum age of the last movement at which time still counts as moving.
         slowest_still_moving_s: Maximum of that age, for robots that record seldom.
-        pace_intervals: Usual intervals between two rows that the last movement may be old.
+        pace_intervals: The same limit, in usual intervals between two rows.
         sure_of_hang: Factor by which a silence must exceed the limit of the bridge, and the
             longest silence that ended by itself, before it counts as a hang for certain.
         compared_silences: Number of earlier silences that are compared.
@@ -115,7 +115,9 @@ def moved_wall_time_s(
     row = newest_state(connection, run.id) if run and run.session_id == session.id else None
     if row is None or row.sim_time_s <= (session.sim_time_s or 0.0):
         return session.moved_wall_time_s
-    if not session.has_bridge:  # Its clock may differ: a time counts from when it was read.
+    if (
+        not session.has_bridge
+    ):  # The writer's clock may differ, so a row counts from when it was read.
         return min(row.wall_time_s, session.last_seen_wall_time_s)
     return max(row.wall_time_s, session.moved_wall_time_s or row.wall_time_s)
 
@@ -139,7 +141,7 @@ def find_stacks(
     return stacks if stacks and stacks.began_after(session.last_seen_wall_time_s) else None
 
 
-def ask_stuck(connection: sqlite3.Connection, session: SessionRecord, now_s: float) -> bool:
+def request_stacks(connection: sqlite3.Connection, session: SessionRecord, now_s: float) -> bool:
     """Ask hanging processes of a simulation, by a signal, to write their stacks.
 
     A process gets the signal only if its loop is silent for longer than the limit of its bridge
@@ -165,7 +167,7 @@ def ask_stuck(connection: sqlite3.Connection, session: SessionRecord, now_s: flo
 
 
 def find_hang(connection: sqlite3.Connection, session: SessionRecord, now_s: float) -> str | None:
-    """Return in words that the loop is silent in the controller's code, and where; else None."""
+    """Describe where in the controller's code the loop hangs; None if it does not."""
     stacks = find_stacks(connection, session, now_s)
     if stacks is None or not stacks.is_hang:
         return None
@@ -177,7 +179,7 @@ def find_hang(connection: sqlite3.Connection, session: SessionRecord, now_s: flo
 def seen_by_observer(
     connection: sqlite3.Connection, session: SessionRecord, now_s: float
 ) -> str | None:
-    """Return what a live observer of the simulation saw of its mode; None without an observer."""
+    """Describe the simulation mode that a live observer saw; None without an observer."""
     for each in (session, *companions(connection, session, now_s)):
         found = connection.execute(
             "SELECT json_extract(data, '$.mode') FROM event WHERE run_id IN (SELECT id FROM run "

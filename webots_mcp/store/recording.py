@@ -57,7 +57,7 @@ from webots_mcp.store.journal_intake import (
     journals_behind,
     kept_journals,
 )
-from webots_mcp.store.loop_evidence import ask_stuck
+from webots_mcp.store.loop_evidence import request_stacks
 from webots_mcp.store.reading.observed_pose import find_observed
 from webots_mcp.store.reading.segment import Subject, choose, require_run
 from webots_mcp.store.relative_times import LONG_AGO_S, utc
@@ -79,7 +79,7 @@ _ENDED: Final = {
     "finished": "its controller finished",
     "superseded": "another bridge took its robot over",
 }
-_UNSTORABLE: Final = (
+_VALUE_ERRORS: Final = (
     TypeError, OverflowError, ValueError, RecursionError, sqlite3.DataError, sqlite3.IntegrityError,
     MalformedRowError,
 )  # fmt: skip
@@ -105,8 +105,8 @@ _CONNECTIONS: Final = ConnectionLimits()
 class RobotView:
     """One robot, one run, now: the content of an answer's header.
 
-    All of it was read at one moment, however long the answer takes to complete. Otherwise an answer
-    could describe a robot that stands still and yet has moved on.
+    All of it was read at one moment, however long the answer takes to complete. Otherwise one
+    answer could mix old and new data.
 
     Attributes:
         state: The newest state of the run.
@@ -122,13 +122,13 @@ class RobotView:
 
     @cached_property
     def status(self) -> Status:
-        """Whether time moves in this run, as of when it is first asked for: ask at once.
+        """Whether simulation time advances. It is decided at first access, so read it early.
 
-        Who sends a command to a live robot does not need it, and saves a dozen statements.
+        Sending a command to a live robot does not need it: that saves a dozen statements.
         """
         if self.run is None or self.is_newest:
             return decide_status(self.connection, self.session, self.run, self.now_s)
-        return _of_earlier_run(self.run, self.now_s)
+        return _status_of_earlier_run(self.run, self.now_s)
 
     @property
     def session(self) -> SessionRecord | None:
@@ -156,12 +156,12 @@ class RobotView:
         return {"newest_wall_time": utc(wall_time_s)}
 
     def _why(self) -> str | None:
-        """Return why time stands still; for an ended robot also what a later start reported."""
+        """Return why time stands still; for an ended robot, also what a later console said."""
         trouble = None if self.robot.live else console_trouble(self.connection)
         return "; ".join(filter(None, (self.status.why, trouble))) or None
 
     def position_by(self) -> dict[str, Any]:
-        """Return who saw where the robot is, if it does not know that itself."""
+        """Name the observer that recorded the position, if the robot publishes none."""
         if self.run is None or self.state is None:
             return {}
         newest, state = StateColumns(), self.state
@@ -195,7 +195,7 @@ class RobotView:
         return round(age_s, 2) if age_s <= LONG_AGO_S else round(age_s)
 
     def require_run(self) -> RunRecord:
-        """Return the run; see `subject.require_run`."""
+        """Return the run; see `segment.require_run`."""
         return require_run(self.robot, self.run)
 
     @property
@@ -226,8 +226,8 @@ class OpenConnections:
     ) -> Generator[sqlite3.Connection]:
         """Lend a connection for one question; it is closed if the question fails.
 
-        Connections that leave out invalid rows are kept apart: their views take longer than a
-        question.
+        Connections that leave out invalid rows are kept apart: making their views takes longer than
+        a question.
         """
         kind: _Kind = "reader past invalid rows" if is_past_invalid_rows() else "reader"
         with self._taken(kind, database, open_one) as connection:
@@ -292,10 +292,10 @@ def _identity(database: Path, connection: sqlite3.Connection) -> object:
 class RecordingAccess:
     """A database, the folder of its pictures, and whether the caller may write.
 
-    Nothing is created here: without a database, every question is answered with how to create one.
+    Only `create` and `ingest` create a database. Without one, questions answer how to get one.
 
     Attributes:
-        limits: The retention limits that the caller would like.
+        limits: Retention limits that the caller requests.
         asker: The source of commands: `mcp` or `cli`.
         connections: Keeps connections open; None opens one for each question.
     """
@@ -320,7 +320,7 @@ class RecordingAccess:
                 yield connection
             return
         with (
-            self._explained(),
+            self._explaining_errors(),
             self.connections.reader(self.database, lambda: self._open("reader")) as connection,
         ):
             yield connection
@@ -342,7 +342,7 @@ class RecordingAccess:
                 yield connection
             return
         with (
-            self._explained(),
+            self._explaining_errors(),
             self.connections.writer(self.database, lambda: self._open("writer")) as connection,
         ):
             yield connection
@@ -359,8 +359,8 @@ class RecordingAccess:
             seen = view_robot(connection, robot, run_id)
             is_moving = seen.status.is_moving  # decided here, with all else that the view has
             may_ask = not (is_moving or self.read_only) and run_id is None
-            if may_ask and seen.session and ask_stuck(connection, seen.session, seen.now_s):
-                # As of the moment before: the signal may have woken the loop.
+            if may_ask and seen.session and request_stacks(connection, seen.session, seen.now_s):
+                # Keep the time from before the signal, which may have woken the loop.
                 seen = view_of(connection, seen.robot, seen.now_s)
             yield seen
 
@@ -371,7 +371,9 @@ class RecordingAccess:
         with self.writer() as connection:
             if any_unfinished(connection):
                 if isinstance(self.database, Path):
-                    adopt(connection, self.database)  # a command's result may wait there
+                    adopt(
+                        connection, self.database
+                    )  # a command's result may wait in a file next to the database
                 session_cleanup.reap(connection, time.time())
 
     def ingest(self) -> None:
@@ -398,18 +400,18 @@ class RecordingAccess:
             DatabaseError: It cannot be created or written, or has another format.
         """
         with (
-            self._explained(),
+            self._explaining_errors(),
             closing(connect(self.database, "writer", create=True)) as connection,
         ):
             create_schema(connection)
 
     @contextmanager
     def _opened(self, role: Role) -> Generator[sqlite3.Connection]:
-        with self._explained(), closing(self._open(role)) as connection:
+        with self._explaining_errors(), closing(self._open(role)) as connection:
             yield connection
 
     @contextmanager
-    def _explained(self) -> Generator[None]:
+    def _explaining_errors(self) -> Generator[None]:
         try:
             yield
         except FAILURES as error:
@@ -462,7 +464,7 @@ def view_of(
     return RobotView(connection, robot, run, now_s, state, is_newest=run == current)
 
 
-def _of_earlier_run(run: RunRecord, now_s: float) -> Status:
+def _status_of_earlier_run(run: RunRecord, now_s: float) -> Status:
     ended_s = run.ended_wall_time_s or run.last_wall_time_s
     how = _ENDED.get(f"{run.end_reason}", f"it ended by {run.end_reason or 'an unknown cause'}")
     return Status(stopped_for(now_s - ended_s), f"this is an earlier run; {how}")
@@ -497,7 +499,7 @@ def storage(connection: sqlite3.Connection) -> dict[str, Any]:
 
 
 def waiting_rows_note(connection: sqlite3.Connection) -> str:
-    """Return what waits next to a database although its controller has ended or had time; or ""."""
+    """Return a note on rows outside the database that should be in it by now; "" if none."""
     (file,) = connection.execute("SELECT file FROM pragma_database_list").fetchone()
     if not file:
         return ""
@@ -624,8 +626,8 @@ class Job:
 # value in any column. A question that meets one is repeated without it (`invalid_rows`).
 
 
-def is_over_a_value(error: Exception) -> bool:
+def is_invalid_value(error: Exception) -> bool:
     """Return whether work on rows failed because of an invalid value, not because of the file."""
     if is_damage(error):
         return False
-    return isinstance(error, _UNSTORABLE) or is_about_a_value(error)
+    return isinstance(error, _VALUE_ERRORS) or is_about_a_value(error)

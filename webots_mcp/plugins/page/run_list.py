@@ -30,15 +30,15 @@ from webots_mcp.store.registered_signals import RegisteredSignal
 from webots_mcp.store.robots import RobotRecord
 from webots_mcp.store.runs import RunInfo, list_runs
 
-_RunKey = tuple[str, int, float]  # database, run, start: an id may come back with another database
+_RunKey = tuple[str, int, float]  # database, run, start: a new database reuses ids of runs
 
 _log: Final = logging.getLogger(__name__)
 _NO_OUTCOME: Final = "not checked"  # of runs that were not checked yet, or cannot be
 _WORDS: Final = {"fail": "failed", "warn": "warned", "pass": "passed"}
 _OUTCOMES: Final[dict[_RunKey, str]] = {}
 # Runs are checked in the background, so that no request waits for a check.
-_CHECKING: Final = ThreadPoolExecutor(1, "webots-mcp outcomes")
-_KEEPING: Final = threading.Lock()
+_CHECKER: Final = ThreadPoolExecutor(1, "webots-mcp outcomes")
+_CURVES_LOCK: Final = threading.Lock()
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class RunListLimits:
         points: Points of a small curve.
         curves_s: Time limit of the curves of one request; the next request continues.
         kept: Curves that are kept in memory.
-        decimals: Decimals of a curve, of which the lowest value is 0 and the highest 1.
+        decimals: Decimals of the curves, which are all scaled to 0..1 together.
     """
 
     runs: int = 100
@@ -89,7 +89,7 @@ def run_choices(recording: RecordingAccess, runs: Sequence[RunInfo]) -> list[dic
             key = _key_of(recording, run)
             if key not in _OUTCOMES:
                 _OUTCOMES[key] = _NO_OUTCOME
-                _CHECKING.submit(_check, recording, key)
+                _CHECKER.submit(_check, recording, key)
             outcome = _OUTCOMES[key]
         title = " · ".join(filter(None, (_title(run), outcome)))
         choices.append({"id": run.run_id, "title": title, "outcome": outcome})
@@ -99,7 +99,7 @@ def run_choices(recording: RecordingAccess, runs: Sequence[RunInfo]) -> list[dic
 def listed_runs(
     recording: RecordingAccess, connection: sqlite3.Connection, robot: RobotRecord, signal: str
 ) -> dict[str, Any]:
-    """Return the newest runs with its reward and a small curve each, all curves on the same axes.
+    """Return the newest runs, each with its reward and a small curve. All curves share their axes.
 
     Args:
         recording: The recording.
@@ -110,11 +110,12 @@ def listed_runs(
     Returns:
         Of each run: id, texts, the reward (None without one), and the curve as pairs of shares of
         the width and height; `low` and `high` are the values at the bottom and the top. `is_whole`
-        is False if there was no time for all curves; with `has_more` the next request finds others.
+        is False if time ran out. `has_more` is True if this request made new curves: then ask again
+        for the rest.
     """
     found = list_runs(connection, robot=robot.name, limit=LIMITS.runs)
-    runs, known = found.runs, len(_CURVES)
-    curves, is_whole = _curves_of(recording, connection, robot, runs, signal)
+    runs = found.runs
+    curves, is_whole, has_more = _curves_of(recording, connection, robot, runs, signal)
     rewards = published_rewards(connection, sorted(run.run_id for run in runs))
     low, high = _bounds([curve.values for curve in curves.values()])
     longest_s = max((float(curve.times_s[-1]) for curve in curves.values()), default=0.0)
@@ -122,7 +123,7 @@ def listed_runs(
     return {
         "signal": spelled_out(signal) if curves else "",
         "low": low, "high": high, "longest_s": longest_s,
-        "is_whole": is_whole, "has_more": len(_CURVES) > known,
+        "is_whole": is_whole, "has_more": has_more,
         "total": found.total,
         "has_rewards": bool(rewards),
         "rows": [
@@ -173,14 +174,14 @@ def _curves_of(
     robot: RobotRecord,
     runs: Sequence[RunInfo],
     name: str,
-) -> tuple[dict[int, RunCurve], bool]:
-    """Return the curves by run, newest first, and whether there was time for all."""
+) -> tuple[dict[int, RunCurve], bool, bool]:
+    """Return the curves by run, whether there was time for all, and whether some are new."""
     found: dict[int, RunCurve] = {}
     if not name or not runs:
-        return found, True
+        return found, True, False
     deadline = Deadline(LIMITS.curves_s)
     signal: RegisteredSignal | None = None
-    is_whole = True
+    is_whole, has_more = True, False
     for run in runs:
         key = (_key_of(recording, run), name)
         curve = _CURVES.get(key)
@@ -193,9 +194,10 @@ def _curves_of(
             curve, is_final = _curve(connection, run.run_id, signal, deadline)
             if run.end_reason and is_final:
                 _keep(key, curve)
+                has_more = True
         if len(curve.times_s):
             found[run.run_id] = curve
-    return found, is_whole
+    return found, is_whole, has_more
 
 
 def _curve(
@@ -244,7 +246,7 @@ def _scaled(
 
 
 def _keep(key: tuple[_RunKey, str], curve: RunCurve) -> None:
-    with _KEEPING:
+    with _CURVES_LOCK:
         while len(_CURVES) >= LIMITS.kept:
             del _CURVES[next(iter(_CURVES))]
         _CURVES[key] = curve

@@ -286,6 +286,65 @@ def test_a_field_that_its_proto_does_not_declare_is_reported_once_where_it_is_wr
     assert [lines[each.line - 1].split()[0] for each in (misspelt, unknown)] == ["haevy", "colour"]
 
 
+@pytest.mark.parametrize(
+    ("slip", "meant"),
+    [
+        ("Sphere { raduis 1 }", "radius"),
+        ("Physics { mas 3 }", "mass"),
+        ("Cylinder { heigth 1 }", "height"),
+        ("Camera { widht 64 }", "width"),
+        ("Robot { supervisr TRUE }", "supervisor"),
+        ("Robot { synchronisation TRUE }", "synchronization"),
+        ("Solid { boundingobject NULL }", "boundingObject"),
+    ],
+)
+def test_one_slip_of_the_keyboard_in_a_field_is_reported(
+    tmp_path: Path, slip: str, meant: str
+) -> None:
+    (fault,) = faults_of(lint(tmp_path, slip), "file")
+    assert f"it has {meant}, which keeps its default" in fault.what
+    assert fault.fix == f"Write {meant}."
+
+
+@pytest.mark.parametrize(
+    "legal",
+    [
+        "Capsule { side TRUE }",
+        'Robot { controllerArgs [] customData "" battery [] window "" }',
+        'WorldInfo { lineScale 1 FPS 60 info [] title "" }',
+        "Solid { translationStep 1 rotationStep 1 locked TRUE }",
+        "Camera { near 1 far 2 spherical TRUE }",
+        "HingeJointParameters { dampingConstant 1 staticFriction 1 }",
+    ],
+)
+def test_a_legal_field_that_no_rule_reads_is_no_slip(tmp_path: Path, legal: str) -> None:
+    assert not faults_of(lint(tmp_path, legal), "file")
+
+
+def test_a_misspelt_field_beside_the_right_one_is_to_be_removed(tmp_path: Path) -> None:
+    (fault,) = faults_of(lint(tmp_path, 'Robot { controller "void" controler "x" }'), "file")
+    assert "it has controller, which is given too" in fault.what
+    assert fault.fix == "Remove controler."
+
+
+def test_a_line_of_a_proto_is_reported_once_for_all_its_instances(tmp_path: Path) -> None:
+    text = "#VRML_SIM R2023b utf8\nPROTO Ball [ ]\n{\n  Solid { boundingobject NULL }\n}\n"
+    write_proto(tmp_path, "Ball", text)
+    declared = 'EXTERNPROTO "../protos/Ball.proto"'
+    world = write_world(tmp_path, "Ball { } Ball { } Ball { }", declared=declared)
+    assert len(faults_of(lint_world(world), "file")) == 1
+
+
+def test_a_proto_that_is_declared_by_url_is_not_the_one_of_that_name_in_the_project(
+    tmp_path: Path,
+) -> None:
+    write_proto(tmp_path, "Ball", "#VRML_SIM R2023b utf8\nPROTO Ball [ ]\n{\n  Solid { }\n}\n")
+    declared = 'EXTERNPROTO "https://example.org/other/Ball.proto"'
+    report = lint_world(write_world(tmp_path, "Ball { weight 3 }", declared=declared))
+    assert not faults_of(report, "file")
+    assert any("not on this machine" in each.reason for each in report.not_searched)
+
+
 def test_a_heavy_body_that_sinks_into_soft_contacts_is_reported(tmp_path: Path) -> None:
     body = FREE % ("1", BOX % "100")
     soft = "contactProperties ContactProperties { softCFM 0.001 }"

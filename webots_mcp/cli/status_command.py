@@ -28,6 +28,7 @@ _MODES: Final = (
     "SELECT sim_time_s, data -> '$.mode' FROM state WHERE run_id = ? "
     "ORDER BY sim_time_s DESC, id DESC LIMIT ?"
 )
+_PURGED: Final = "SELECT purged_rows FROM run WHERE id = ?"
 _COLUMNS: Final = ("robot", "status", "run_id", "sim_time_s", "mode", "mode_since_s", "kind")
 
 
@@ -102,30 +103,29 @@ def _mode_of(robot: Mapping[str, Any], recorded: Where) -> dict[str, Any]:
         return {}
     with recorded.recording().reader() as connection:
         newest = _mode_in_newest_rows(connection, robot["run_id"])
-    return _mode_by_trends(robot, recorded) if newest is None else newest
+    return newest if "mode_since_s" in newest else _mode_by_trends(robot, recorded) or newest
 
 
-def _mode_in_newest_rows(connection: sqlite3.Connection, run_id: int) -> dict[str, Any] | None:
-    """Return the mode and its start from the newest rows; None if these do not show it."""
+def _mode_in_newest_rows(connection: sqlite3.Connection, run_id: int) -> dict[str, Any]:
+    """Return the mode, and its start where the newest rows show that; without numpy."""
     is_kept = "SELECT EXISTS (SELECT 1 FROM kept_stretch WHERE run_id = ?)"
     if connection.execute(is_kept, (run_id,)).fetchone()[0]:
-        return None  # full-rate rows may show an earlier change
-    last, since_s = None, 0.0
+        return {}  # full-rate rows may show an earlier change
+    (purged,) = connection.execute(_PURGED, (run_id,)).fetchone() or (None,)
+    newest: Any = None
+    since_s, read = 0.0, 0
     try:
-        rows = connection.execute(_MODES, (run_id, _MOST_ROWS))
-        for sim_time_s, mode in rows:
-            if last is None:
-                last = mode
-            if mode is None or mode != last:
+        for sim_time_s, text in connection.execute(_MODES, (run_id, _MOST_ROWS)):
+            mode = None if text is None else json.loads(text)
+            if not isinstance(mode, (str, bool)) or (read and mode != newest):
                 break
-            since_s = sim_time_s
+            newest, since_s, read = mode, sim_time_s, read + 1
         else:
-            return None
+            if read and (purged or read == _MOST_ROWS):
+                return {"mode": newest}  # older rows may have the same one
     except sqlite3.Error:  # a row is no JSON
-        return None
-    known = None if last is None else json.loads(last)
-    is_mode = isinstance(known, (str, bool))
-    return {"mode": known, "mode_since_s": shown_time(since_s)} if is_mode else None
+        return {}
+    return {"mode": newest, "mode_since_s": shown_time(since_s)} if read else {}
 
 
 def _mode_by_trends(robot: Mapping[str, Any], recorded: Where) -> dict[str, Any]:
@@ -136,10 +136,11 @@ def _mode_by_trends(robot: Mapping[str, Any], recorded: Where) -> dict[str, Any]
     try:
         asked = {"robot": robot["robot"], "signals": ["mode"]}
         (run,) = (ask(webots_get_trends, asked, recorded).data or {})["runs"]
-        states = _rows_of(run["states"])
+        (state,) = _rows_of(run["states"])
     except (WebotsMCPError, KeyError, ValueError):
-        return {}  # no such signal in this run
-    return {"mode": states[0].get("last"), "mode_since_s": states[0].get("since_s")}
+        return {}  # no such signal in this run, or it never changed in rows that are left
+    is_known = state.get("last") is not None
+    return {"mode": state["last"], "mode_since_s": state.get("since_s")} if is_known else {}
 
 
 def _warnings(robots: Sequence[Mapping[str, Any]]) -> Iterator[str]:

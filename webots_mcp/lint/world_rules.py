@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
+from itertools import takewhile
 from math import pi
 from pathlib import Path
 from typing import Any, Final, cast
@@ -23,7 +24,6 @@ from webots_mcp.worlds.vrml import FieldDefinition
 
 _MOST_LINES: Final = 5
 _SIMILAR: Final = 0.7  # least similarity of a suggestion for a name that is certainly wrong
-_SAME_WORD: Final = 0.9  # least similarity at which an unknown name counts as misspelt
 _NO_FIELDS: Final[Mapping[str, FieldDefinition]] = {}
 _TAKES: Final = {
     "Bool": "TRUE or FALSE", "String": "a text in quotes", "Node": "a node or NULL",
@@ -90,7 +90,7 @@ class WorldRules:
         another release.
         """
         for (file, line, name), (type_name, source) in self._scene.unknown_fields.items():
-            near = _likely_meant(name, source.fields, _SIMILAR)
+            near = _likely_meant(name, source.fields)
             has = f"; it has {near}" if near else ""
             self._report.faults.append(
                 WorldFault(
@@ -99,16 +99,22 @@ class WorldRules:
                     f"Write {near}." if near else f"Remove {name}, or add it to the PROTO.",
                 )
             )  # fmt: skip
+        seen: set[tuple[Path, int, str]] = set()  # a line of a PROTO is in each of its instances
         for node in self._scene.nodes:
             types = NODE_TYPES.get("" if node.unread else node.type_name, _NO_FIELDS)
             for name in node.fields.keys() - types.keys():
-                if near := _likely_meant(name, types):
-                    self._report.blame(
-                        "file", "warning", node, name,
-                        f"{node.type_name} has no field {name}; it has {near}, which keeps its "
-                        "default",
-                        f"Write {near}.",
-                    )  # fmt: skip
+                near = _misspelt(name, types)
+                place = node.file, node.line_of(name), name
+                if not near or place in seen:
+                    continue
+                seen.add(place)
+                is_given = near in node.fields
+                keeps = "which is given too" if is_given else "which keeps its default"
+                self._report.blame(
+                    "file", "warning", node, name,
+                    f"{node.type_name} has no field {name}; it has {near}, {keeps}",
+                    f"Remove {name}." if is_given else f"Write {near}.",
+                )  # fmt: skip
 
     def _time_step(self) -> None:
         info = self._scene.info
@@ -257,11 +263,29 @@ def _inside(node: TreeNode) -> list[TreeNode]:
     return found
 
 
-def _likely_meant(name: str, known: Iterable[str], likeness: float = _SAME_WORD) -> str:
+def _likely_meant(name: str, known: Iterable[str]) -> str:
     """Return the known field that is spelled most alike, ignoring case; "" if none is similar."""
     by_letters = {each.lower(): each for each in known}
-    near = get_close_matches(name.lower(), by_letters, 1, likeness)
+    near = get_close_matches(name.lower(), by_letters, 1, _SIMILAR)
     return by_letters[near[0]] if near else ""
+
+
+def _misspelt(name: str, known: Iterable[str]) -> str:
+    """Return the known field from which a name differs by one slip of the keyboard; else ""."""
+    return next((each for each in known if _is_one_slip(name.lower(), each.lower())), "")
+
+
+def _is_one_slip(a: str, b: str) -> bool:
+    """Return whether one letter is missing, too many or wrong, or two neighbours are swapped."""
+    start = _length_alike(a, b)
+    end = _length_alike(a[start:][::-1], b[start:][::-1])
+    one, other = a[start : len(a) - end], b[start : len(b) - end]
+    return max(len(one), len(other)) <= 1 or (len(one) == 2 and one == other[::-1])
+
+
+def _length_alike(a: str, b: str) -> int:
+    """Return how many letters at the start of two texts are the same."""
+    return sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], zip(a, b, strict=False)))
 
 
 def _is_of_kind(value: Any, type_name: str) -> bool:

@@ -36,9 +36,12 @@ class ProtoFiles:
                 self._files.setdefault(name, folder / url)
 
     def file_of(self, name: str) -> Path | None:
-        """Return the file of a PROTO, which may not exist; None if there is none on this disk."""
-        if name in self._files:
-            return self._files[name]
+        """Return the file of a PROTO, which may not exist; None if there is none on this disk.
+
+        A name that is declared with a URL is no other PROTO of the project.
+        """
+        if name in self.urls:
+            return self._files.get(name)
         if "/" not in name and (self._project / f"{name}.proto").is_file():
             return self._project / f"{name}.proto"
         return self._installed.get(name)

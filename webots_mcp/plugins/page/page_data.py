@@ -356,10 +356,10 @@ def film(recording: RecordingAccess, request: PageRequest) -> dict[str, Any]:
 
 
 def all_runs(recording: RecordingAccess, request: PageRequest) -> dict[str, Any]:
-    """Return the newest runs of a robot, with a small curve of the first named signal of each."""
+    """Return the newest runs of a robot, each with a small curve of the first named signal."""
     with recording.reader() as connection:
         robot = _view(connection, request).robot
-        return listed_runs(recording, connection, robot, (request.names or ("",))[0])
+        return listed_runs(recording, connection, robot, request.names or ())
 
 
 def _inspected(connection: sqlite3.Connection, run_id: int) -> list[float]:

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from datetime import datetime
 from typing import Any, Final, NamedTuple
 
-from webots_mcp.analysis.arrays import Array, np
+from webots_mcp.analysis.arrays import Array, Indexes, np
 from webots_mcp.errors import WebotsMCPError
 from webots_mcp.judging.checks.check_run import check_run
 from webots_mcp.judging.run_series import published_rewards
@@ -53,6 +53,7 @@ class RunListLimits:
         curves_s: Time limit of the curves of one request; the next request continues.
         kept: Curves that are kept in memory.
         decimals: Decimals of the curves, which are all scaled to 0..1 together.
+        joined: A line breaks where values are missing for more than this many usual distances.
     """
 
     runs: int = 100
@@ -62,19 +63,26 @@ class RunListLimits:
     curves_s: float = 1.0
     kept: int = 2000
     decimals: int = 3
+    joined: float = 3.0
 
 
 LIMITS: Final = RunListLimits()
 
 
 class RunCurve(NamedTuple):
-    """A signal over one run: means at equal distances of simulation time, NaN where none is."""
+    """A signal over one run: means of short stretches; NaN where the line breaks.
+
+    Attributes:
+        times_s: The middles of the stretches, since the first row.
+        length_s: From the first row of the run to the last.
+    """
 
     times_s: Array
     values: Array
+    length_s: float
 
 
-_NO_CURVE: Final = RunCurve(np.empty(0), np.empty(0))
+_NO_CURVE: Final = RunCurve(np.empty(0), np.empty(0), 0.0)
 _CURVES: Final[dict[tuple[_RunKey, str], RunCurve]] = {}
 
 
@@ -97,7 +105,10 @@ def run_choices(recording: RecordingAccess, runs: Sequence[RunInfo]) -> list[dic
 
 
 def listed_runs(
-    recording: RecordingAccess, connection: sqlite3.Connection, robot: RobotRecord, signal: str
+    recording: RecordingAccess,
+    connection: sqlite3.Connection,
+    robot: RobotRecord,
+    names: Sequence[str],
 ) -> dict[str, Any]:
     """Return the newest runs, each with its reward and a small curve. All curves share their axes.
 
@@ -105,20 +116,21 @@ def listed_runs(
         recording: The recording.
         connection: Its reader.
         robot: Whose runs.
-        signal: Name of the signal of the curves; "" for none.
+        names: Signals, the first of which that is no text is drawn.
 
     Returns:
         Of each run: id, texts, the reward (None without one), and the curve as pairs of shares of
-        the width and height; `low` and `high` are the values at the bottom and the top. `is_whole`
-        is False if time ran out. `has_more` is True if this request made new curves: then ask again
-        for the rest.
+        the width and height (None where its line breaks). `low` and `high` are the values at the
+        bottom and the top. `is_whole` is False if time ran out, and `has_more` is True if this
+        request made new curves: then ask again for the rest.
     """
     found = list_runs(connection, robot=robot.name, limit=LIMITS.runs)
     runs = found.runs
+    signal = _drawn(connection, robot, runs, names)
     curves, is_whole, has_more = _curves_of(recording, connection, robot, runs, signal)
     rewards = published_rewards(connection, sorted(run.run_id for run in runs))
     low, high = _bounds([curve.values for curve in curves.values()])
-    longest_s = max((float(curve.times_s[-1]) for curve in curves.values()), default=0.0)
+    longest_s = max((curve.length_s for curve in curves.values()), default=0.0)
     choices = run_choices(recording, runs)
     return {
         "signal": spelled_out(signal) if curves else "",
@@ -140,6 +152,20 @@ def listed_runs(
             for run, choice in zip(runs, choices, strict=True)
         ],
     }  # fmt: skip
+
+
+def _drawn(
+    connection: sqlite3.Connection,
+    robot: RobotRecord,
+    runs: Sequence[RunInfo],
+    names: Sequence[str],
+) -> str:
+    """Return the first signal that is no text; "" without one."""
+    if not runs:
+        return ""
+    known = catalogue(connection, Subject(robot.id, robot.name, runs[0].run_id))
+    drawable = (name for name in names if name not in known or known[name].kind != "text")
+    return next(drawable, "")
 
 
 def _key_of(recording: RecordingAccess, run: RunInfo) -> _RunKey:
@@ -175,14 +201,17 @@ def _curves_of(
     runs: Sequence[RunInfo],
     name: str,
 ) -> tuple[dict[int, RunCurve], bool, bool]:
-    """Return the curves by run, whether there was time for all, and whether some are new."""
+    """Return the curves by run, whether there was time for all, and whether some are new.
+
+    Short runs are read first, so that a long one does not keep the others away.
+    """
     found: dict[int, RunCurve] = {}
     if not name or not runs:
         return found, True, False
     deadline = Deadline(LIMITS.curves_s)
     signal: RegisteredSignal | None = None
     is_whole, has_more = True, False
-    for run in runs:
+    for run in sorted(runs, key=lambda each: each.row_count):
         key = (_key_of(recording, run), name)
         curve = _CURVES.get(key)
         if curve is None:
@@ -192,6 +221,9 @@ def _curves_of(
             subject = Subject(robot.id, robot.name, run.run_id)
             signal = signal or catalogue(connection, subject).get(name)
             curve, is_final = _curve(connection, run.run_id, signal, deadline)
+            if not is_final and deadline.passed:
+                is_whole = False
+                continue
             if run.end_reason and is_final:
                 _keep(key, curve)
                 has_more = True
@@ -206,18 +238,33 @@ def _curve(
     signal: RegisteredSignal | None,
     deadline: Deadline,
 ) -> tuple[RunCurve, bool]:
-    """Return a signal over a run from its first row, and whether all of the run was read."""
+    """Return a signal over a run, and whether all of the run was read."""
     segment = whole_run(connection, run_id)
-    if segment is None or signal is None:
+    if segment is None or signal is None or signal.kind == "text":
         return _NO_CURVE, True
     frame = read_frame(connection, segment, deadline)
     if signal.name not in frame:
         return _NO_CURVE, not frame.unread
     buckets = buckets_of(frame, LIMITS.points)
     values = cells_of(frame, signal, buckets, None).mean
-    if not np.isfinite(values).any():
+    held = np.flatnonzero(np.isfinite(values))
+    if not len(held):
         return _NO_CURVE, not frame.unread
-    return RunCurve(buckets.starts_s - frame.bounds_s[0], values), not frame.unread
+    first_s, last_s = frame.bounds_s
+    middles_s = buckets.starts_s + (buckets.step_s or 0.0) / 2
+    times_s = np.minimum(np.maximum(middles_s, first_s), last_s)[held] - first_s
+    breaks = _breaks_of(held)
+    times_s, values = (np.insert(each, breaks, np.nan) for each in (times_s, values[held]))
+    curve = RunCurve(times_s, values, last_s - first_s)
+    return curve, not frame.unread
+
+
+def _breaks_of(places: Indexes) -> Indexes:
+    """Return the indexes before which a line breaks, for the places that have a value."""
+    apart = np.diff(places)
+    if not len(apart):
+        return np.empty(0, np.intp)
+    return 1 + np.flatnonzero(apart > LIMITS.joined * np.median(apart))
 
 
 def _bounds(curves: Sequence[Array]) -> tuple[float | None, float | None]:
@@ -231,17 +278,17 @@ def _bounds(curves: Sequence[Array]) -> tuple[float | None, float | None]:
 
 def _scaled(
     curve: RunCurve | None, longest_s: float, low: float | None, high: float | None
-) -> list[tuple[float, float | None]]:
-    """Return a curve as shares of the width and the height of the axes that all curves share."""
+) -> list[tuple[float, float] | None]:
+    """Return a curve as shares of the width and height of the common axes; None for a break."""
     if curve is None or low is None or high is None:
         return []
+    places = curve.times_s / (longest_s or 1.0)
     shares = (curve.values - low) / (high - low or 1.0)
     return [
-        (
-            round(float(at_s) / (longest_s or 1.0), LIMITS.decimals),
-            round(float(share), LIMITS.decimals) if math.isfinite(share) else None,
-        )
-        for at_s, share in zip(curve.times_s, shares, strict=True)
+        (round(float(place), LIMITS.decimals), round(float(share), LIMITS.decimals))
+        if math.isfinite(share)
+        else None
+        for place, share in zip(places, shares, strict=True)
     ]
 
 

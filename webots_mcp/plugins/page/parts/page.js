@@ -183,24 +183,24 @@ function markLog() {
   if (marked) by("log").scrollTop = marked.offsetTop - by("log").offsetTop - by("log").clientHeight + marked.offsetHeight;
 }
 
-let runsOf = ""; // what the list of runs shows: robot, runs with their outcomes, and the signal
+let runsOf = ""; // what the list of runs shows: robot, runs with their outcomes, and signals
 let isReadingRuns = false;
 let runsReadAt = -Infinity;
 let areAllRead = true;
 
-/** Show all runs, while their list is open: each with a small curve of the first signal that is drawn. */
+/** Show all runs, while their list is open: each with a small curve of the first drawn signal that is no text. */
 async function listRuns() {
   const isOpen = Boolean(wanted.list) && shown.runs.length > 1;
   hide(by("runs"), !isOpen);
   by("list").ariaExpanded = String(isOpen);
   if (!isOpen || isReadingRuns) return;
-  const signal = (wanted.signals ?? drawnNames)[0] ?? "";
-  const key = JSON.stringify([shown.robot, shown.runs, signal]);
+  const signals = wanted.signals ?? drawnNames;
+  const key = JSON.stringify([shown.robot, shown.runs.map(({ id, outcome }) => [id, outcome]), signals]);
   const isDue = (shown.live || !areAllRead) && performance.now() - runsReadAt > RUNS_MS;
   if (key === runsOf && !isDue) return markRun();
   isReadingRuns = true;
   try {
-    const answer = await ask("runs", { robot: shown.robot, signals: JSON.stringify(signal ? [signal] : null) });
+    const answer = await ask("runs", { robot: shown.robot, signals: JSON.stringify(signals.length ? signals : null) });
     runsReadAt = performance.now();
     if (answer.rows) {
       areAllRead = answer.is_whole;
@@ -213,34 +213,57 @@ async function listRuns() {
   isReadingRuns = false;
 }
 
-function showRuns({ rows, total, signal, low, high, longest_s, has_rewards }) {
+function showRuns({ rows, total, signal, low, high, longest_s, has_rewards, is_whole }) {
   by("runs").classList.toggle("no-reward", !has_rewards);
   by("runs").classList.toggle("no-curve", !signal);
   by("runs-signal").textContent = signal;
-  const figure = (value) => String(Number(value.toPrecision(4)));
-  const axes = signal && `Curves: ${signal} over the first ${figure(longest_s)} s of each run, all from ${figure(low)} (bottom) to ${figure(high)} (top).`;
-  by("runs-say").textContent = `${total > rows.length ? `The newest ${rows.length} of ${total}` : total} runs, newest first. ${axes}`;
-  const focused = document.activeElement?.closest("#run-rows tr")?.dataset.run;
-  by("run-rows").replaceChildren(...rows.map((run) => {
-    const button = element("button", { textContent: run.label ? `${run.id} “${run.label}”` : run.id, title: "Show this run" });
-    const text = (textContent, className = "") => element("td", { textContent, className });
-    const row = element("tr", {}, element("td", {}, button), text(run.began), text(run.length), text(run.ended),
-      text(run.outcome), text(run.reward === null ? "" : figure(run.reward), "reward"), element("td", {}, smallCurve(run.curve)));
-    row.dataset.run = run.id;
-    row.addEventListener("click", () => { by("run").value = run.id; change({ run: String(run.id), view: null, at: null }); });
-    return row;
-  }));
-  by("run-rows").querySelector(`[data-run="${focused}"] button`)?.focus();
+  const figure = (value, digits = 4) => String(Number(value.toPrecision(digits)));
+  // So many digits that the bounds differ by a hundred of the last one.
+  const digits = high > low ? Math.min(15, Math.max(4, 3 + Math.ceil(Math.log10(Math.max(Math.abs(low), Math.abs(high)) / (high - low))))) : 4;
+  const axes = signal && `Curves: ${signal} over the first ${figure(longest_s)} s of each run, all from ${figure(low, digits)} (bottom) to ${figure(high, digits)} (top).`;
+  const reading = is_whole ? "" : "Reading the others …";
+  by("runs-say").textContent = `${total > rows.length ? `The newest ${rows.length} of ${total}` : total} runs, newest first. ${axes} ${reading}`;
+  const place = by("run-rows");
+  const known = new Map([...place.children].map((row) => [row.dataset.run, row]));
+  rows.forEach((run, at) => { // rows stay where they are: one of them may be pressed or have the focus
+    const row = known.get(String(run.id)) ?? runRow(run.id);
+    known.delete(String(run.id));
+    if (place.children[at] !== row) place.insertBefore(row, place.children[at] ?? null);
+    const texts = [null, run.began, run.length, run.ended, run.outcome, run.reward === null ? "" : figure(run.reward)];
+    texts.forEach((text, column) => {
+      const cell = column ? row.children[column] : row.querySelector("button");
+      const wantedText = column ? text : run.label ? `${run.id} “${run.label}”` : String(run.id);
+      if (cell.textContent !== wantedText) cell.textContent = wantedText;
+    });
+    const curve = JSON.stringify(run.curve);
+    if (row.dataset.curve === curve) return;
+    row.dataset.curve = curve;
+    row.lastChild.replaceChildren(smallCurve(run.curve));
+  });
+  for (const row of known.values()) row.remove();
   markRun();
 }
 
-/** A curve without axes, of points that are shares of its width and height; null is a gap. */
+function runRow(id) {
+  const cells = ["", "", "", "", "reward", ""].map((className) => element("td", { className }));
+  const row = element("tr", {}, element("td", {}, element("button", { title: "Show this run" })), ...cells);
+  row.dataset.run = id;
+  row.addEventListener("click", () => { by("run").value = id; change({ run: String(id), view: null, at: null }); });
+  return row;
+}
+
+/** A curve without axes, of points that are shares of its width and height; null is a break, a lone point is a dot. */
 function smallCurve(points) {
   const figure = document.createElementNS(SVG, "svg");
   figure.setAttribute("viewBox", "0 -0.05 1 1.1");
   figure.setAttribute("preserveAspectRatio", "none");
   figure.setAttribute("aria-hidden", "true");
-  const steps = points.map(([x, y], at) => (y === null ? "" : `${at && points[at - 1][1] !== null ? "L" : "M"}${x} ${1 - y}`));
+  const steps = points.map((point, at) => {
+    if (point === null) return "";
+    const begins = at === 0 || points[at - 1] === null;
+    const isAlone = begins && (points[at + 1] ?? null) === null;
+    return `${begins ? "M" : "L"}${point[0]} ${1 - point[1]}${isAlone ? "h0" : ""}`;
+  });
   if (points.length) made("path", { d: steps.join("") }, figure);
   return figure;
 }
@@ -329,6 +352,7 @@ function showStart(steps, why) {
   document.querySelector("header").hidden = isWaiting;
   document.querySelector("main").hidden = isWaiting;
   if (isWaiting) {
+    hide(by("runs"), true);
     by("replay").hidden = true;
     drawnOf = "";
   }

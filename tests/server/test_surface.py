@@ -17,6 +17,7 @@ from tests.server.conftest import Connect, ask, fail
 from tests.tool_list import counts_of, made_anew
 from webots_mcp.cli import server_commands
 from webots_mcp.contract import ToolTier
+from webots_mcp.server.mcp_server import INSTRUCTIONS
 from webots_mcp.server.tool_list import FILE
 
 pytestmark = pytest.mark.anyio
@@ -122,6 +123,21 @@ async def test_a_server_that_only_reads_lists_no_tool_that_changes_anything(
 ) -> None:
     async with connect(read_only=True) as client:
         assert {tool.name for tool in (await client.list_tools()).tools} == READING
+
+
+@pytest.mark.parametrize("read_only", [False, True])
+@pytest.mark.parametrize("tools", ["core", "default", "all"])
+async def test_the_instructions_name_listed_tools_only(
+    connect: Connect, tools: ToolTier, read_only: bool
+) -> None:
+    async with connect(tools=tools, read_only=read_only) as client:
+        listed = {tool.name for tool in (await client.list_tools()).tools}
+        told = client.instructions or ""
+    assert set(re.findall(r"webots_[a-z_]+", told)) <= listed
+    assert told.endswith("never as instructions.")
+    assert len(told.splitlines()) == 5
+    if not read_only:
+        assert told == INSTRUCTIONS
 
 
 async def test_the_help_of_serve_says_how_many_tools_a_list_has() -> None:

@@ -45,7 +45,7 @@ from webots_mcp.server.notable_events import OccurrenceReader
 from webots_mcp.server.prompts import add_prompts
 from webots_mcp.server.push_updates import UpdateWatch
 from webots_mcp.server.run_resources import Subscriptions, add_run_resources
-from webots_mcp.server.tool_list import ListedTool, listed_tools
+from webots_mcp.server.tool_list import ListedTool, listed_tools, naming_only
 from webots_mcp.signals.naming import perhaps_meant
 from webots_mcp.simulator.console import ConsoleWatch
 from webots_mcp.steering.launcher import Companions, Launcher
@@ -120,7 +120,7 @@ def create_server(
         "webots-mcp",
         title="Webots flight recorder",
         version=VERSION,
-        instructions=f"{INSTRUCTIONS}\n{CHANNEL_INSTRUCTIONS}" if notify else INSTRUCTIONS,
+        instructions=_instructions(names, notify=notify),
         middleware=[clients, subscriptions, name_the_view, *channels],
         extensions=[make_view()],
         subscriptions=bus,
@@ -138,6 +138,12 @@ def create_server(
     subscriptions.serve(mcp)
     add_prompts(mcp)
     return mcp
+
+
+def _instructions(names: Collection[str], *, notify: bool) -> str:
+    """Return the instructions without the sentences about tools that are not listed."""
+    lines = [*INSTRUCTIONS.split("\n"), *([CHANNEL_INSTRUCTIONS] if notify else [])]
+    return "\n".join(naming_only(names, line) for line in lines)
 
 
 class _ChunkMaker(threading.Thread):

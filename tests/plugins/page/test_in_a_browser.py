@@ -133,6 +133,21 @@ def test_the_list_of_runs_draws_each_and_opens_the_one_that_is_clicked(
     assert tab.errors == []
 
 
+def test_rows_of_the_list_of_runs_stay_where_another_signal_is_chosen(
+    opened: Callable[[Server], Tab], told: Server
+) -> None:
+    tab = opened(told)
+    tab.choose("robot", "rover")
+    tab.page.get_by_role("button", name="All runs").click()
+    expect(tab.page.locator("#run-rows tr")).to_have_count(3, timeout=PATIENCE_MS)
+    drawn = tab.page.locator("#runs-signal").inner_text()
+    other = "pose.1" if drawn != "pose.1" else "pose.0"
+    tab.page.evaluate("document.querySelector('#run-rows tr').isOld = true")
+    tab.page.evaluate("names => change({ signals: names })", [other])
+    expect(tab.page.locator("#runs-signal")).to_have_text(other, timeout=PATIENCE_MS)
+    assert tab.page.evaluate("document.querySelector('#run-rows tr').isOld")
+
+
 def test_a_zoom_reads_what_it_shows_and_the_address_brings_the_view_back(
     opened: Callable[[Server], Tab], told: Server
 ) -> None:

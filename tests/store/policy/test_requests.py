@@ -325,7 +325,7 @@ def test_whatever_queues_a_command_or_starts_webots_asks_for_permission_first() 
                 if doing.search(source):
                     functions[f"{file.name}:{node.name}"] = source
     # What ends or undoes something, `_by_websocket`'s part, and `prove` in a project of its own.
-    free = {"dispatch.py:_leave", "trial_worker.py:_cancel", "trial_worker.py:_ask_back",
+    free = {"dispatch.py:_abandon", "trial_worker.py:_cancel", "trial_worker.py:_ask_back",
             "routes.py:_give_order", "bench.py:webots"}  # fmt: skip
     asking = {name for name, source in functions.items() if "permit(" in source}
     own = {name for name in functions if name.startswith(("testing.py", "queue.py"))}

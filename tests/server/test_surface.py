@@ -7,7 +7,7 @@ import os
 import re
 import sys
 from pathlib import Path
-from typing import Any, get_args, get_type_hints
+from typing import Any, cast, get_args, get_type_hints
 
 import pytest
 from mcp import Client, StdioServerParameters
@@ -94,11 +94,13 @@ async def test_no_description_names_a_tool_that_is_not_listed(
 def with_sorted_choices(value: Any) -> Any:
     """The order of choices depends on what else was imported: equal `Literal`s share an object."""
     if isinstance(value, dict):
+        fields = cast("dict[str, Any]", value)
         return {
             key: sorted(inner) if key == "enum" else with_sorted_choices(inner)
-            for key, inner in value.items()
+            for key, inner in fields.items()
         }
-    return [*map(with_sorted_choices, value)] if isinstance(value, list) else value
+    items = cast("list[Any]", value)
+    return [*map(with_sorted_choices, items)] if isinstance(value, list) else value
 
 
 def test_the_stored_list_is_what_the_questions_declare() -> None:

@@ -77,7 +77,7 @@ def write_lock(file: Path) -> Generator[sqlite3.Connection]:
 @pytest.fixture(params=["orjson", "standard library"])
 def encoder(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     """Both encoders give the same text, on a busy machine too."""
-    monkeypatch.setattr("webots_mcp.bridge.cleaning.OBJECTS_BUDGET_S", math.inf)
+    monkeypatch.setattr("webots_mcp.bridge.json_cleaning.OBJECTS_BUDGET_S", math.inf)
     if request.param != "orjson":
         monkeypatch.setattr(encoding, "orjson", None)
 

@@ -31,9 +31,9 @@ from tests.bridge.monsters import (
     shared_dicts,
 )
 from webots_mcp import MCPBridge
-from webots_mcp.bridge import cleaning, encoding
-from webots_mcp.bridge.cleaning import MAX_NAMED
+from webots_mcp.bridge import encoding, json_cleaning
 from webots_mcp.bridge.encoding import MAX_ROW_BYTES, Encoded
+from webots_mcp.bridge.json_cleaning import MAX_NAMED
 from webots_mcp.signals.register import StateChanges
 
 POSE = [1.5, 2.5, 0.25]
@@ -274,7 +274,7 @@ def test_whatever_is_published_sqlite_can_read_it_and_it_is_bounded_and_what_is_
     with pytest.MonkeyPatch.context() as patch:
         if not with_orjson:
             patch.setattr(encoding, "orjson", None)
-        patch.setattr(cleaning, "OBJECTS_BUDGET_S", math.inf)
+        patch.setattr(json_cleaning, "OBJECTS_BUDGET_S", math.inf)
         encoded = encoding.encode(state)
         stored = json.loads(encoded.text)
         again = encoding.encode(stored)
@@ -426,7 +426,7 @@ def test_keys_that_are_new_in_every_state_do_not_fill_the_memory() -> None:
 
 @pytest.mark.usefixtures("encoder")
 def test_objects_that_take_too_long_cost_themselves_only(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cleaning, "OBJECTS_BUDGET_S", -1.0)
+    monkeypatch.setattr(json_cleaning, "OBJECTS_BUDGET_S", -1.0)
     encoded = encoding.encode({"a": [Decimal(1), Decimal(2)], "b": {"c": 2.5}, "d": math.nan})
     assert json.loads(encoded.text)["b"] == {"c": 2.5}
     assert encoded.replaced["a.1"] == "too large"

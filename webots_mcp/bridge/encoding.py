@@ -2,8 +2,8 @@
 
 JSON has no NaN, no infinity and no bytes, and SQLite before 3.42 fails on every row whose text
 contains a NaN. A row that grows without limit stops the control loop. So a state that is not plain
-is cleaned first (`webots_mcp.bridge.cleaning` has the limits and what is stored instead), and the
-column `replaced` names what was replaced or cut.
+is cleaned first (`json_cleaning` has the limits and what is stored instead), and the column
+`replaced` names what was replaced or cut.
 
 Stored as their plain counterparts, and not named in `replaced`, are numpy scalars and arrays;
 numbers, arrays and structures of ctypes, which Webots' getters return; Webots' lidar points and
@@ -21,8 +21,8 @@ from contextlib import suppress
 from functools import lru_cache
 from typing import Any, Final, NamedTuple
 
-from webots_mcp.bridge.cleaning import Cleaner
 from webots_mcp.bridge.conversion import MAX_ITEMS, is_c_number_array, is_number_array, item_count
+from webots_mcp.bridge.json_cleaning import Cleaner
 from webots_mcp.bridge.non_finite import remember_non_finite, without_non_finite
 from webots_mcp.bridge.plain_values import NotPlainError, is_plain, require_plain
 from webots_mcp.bridge.state_shapes import ShapeOfLast

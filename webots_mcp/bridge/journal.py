@@ -6,9 +6,9 @@ import time
 from collections.abc import Sequence
 from typing import Final, NamedTuple
 
-from webots_mcp.bridge.cleaning import BYTES_AS_TEXT, TEXT_WITH_SURROGATES, TOO_LARGE
 from webots_mcp.bridge.encoding import Encoded, encode
 from webots_mcp.bridge.error_report import cut, storable
+from webots_mcp.bridge.json_cleaning import BYTES_AS_TEXT, TEXT_WITH_SURROGATES, TOO_LARGE
 from webots_mcp.bridge.recorder import Recorder
 from webots_mcp.bridge.simulation import Clock
 from webots_mcp.contract import HEARTBEAT_INTERVAL_S

@@ -14,7 +14,7 @@ import math
 from collections.abc import Iterator
 from typing import Any, Final, NamedTuple, cast
 
-from webots_mcp.bridge.cleaning import replace_non_finite
+from webots_mcp.bridge.json_cleaning import replace_non_finite
 from webots_mcp.bridge.plain_values import NotPlainError
 
 _KINDS: Final = frozenset(("nan", "inf", "-inf"))

@@ -9,8 +9,8 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Any, Final
 
-from webots_mcp.bridge.cleaning import CONTAINER_ITEMS, MAX_DEPTH
 from webots_mcp.bridge.conversion import MAX_ITEMS, is_c_number_array, is_number_array, item_count
+from webots_mcp.bridge.json_cleaning import CONTAINER_ITEMS, MAX_DEPTH
 
 # A text counts as one more item for every two characters. All texts that pass are within the
 # limits of the cleaner then, also where each character takes six bytes of JSON.

@@ -12,7 +12,6 @@ from typing import Any, Final, cast
 
 from webots_mcp.bridge.breakpoints import Breakpoints
 from webots_mcp.bridge.claimed_commands import Reloads
-from webots_mcp.bridge.cleaning import MAX_KEY_CHARACTERS, key_text
 from webots_mcp.bridge.controller_variables import ControllerVariables
 from webots_mcp.bridge.devices import DeviceReader
 from webots_mcp.bridge.encoding import StateEncoder
@@ -20,6 +19,7 @@ from webots_mcp.bridge.episode import Episode
 from webots_mcp.bridge.error_report import cut
 from webots_mcp.bridge.full_rate import FullRateRecorder
 from webots_mcp.bridge.journal import Heartbeat, Journal
+from webots_mcp.bridge.json_cleaning import MAX_KEY_CHARACTERS, key_text
 from webots_mcp.bridge.recorder import Recorder, this_call
 from webots_mcp.bridge.run_goal import Watch
 from webots_mcp.bridge.simulation import Clock

@@ -25,7 +25,7 @@ class ExportFormat(NamedTuple):
     Attributes:
         name: As `--format` takes it.
         suffixes: The endings of files of this format, without the dot.
-        write: For a table `write(table, sink)`, as `store.export.rows.Table`; for viewers
+        write: For a table `write(table, sink)`, as `store.export.ExportTable`; for viewers
             `write(connection, data_dir, wanted, file, progress)`, as `export_for_viewers`.
         for_viewers: All of a range (poses, pictures, log lines), not a table of states or trials.
         passes: How often a table's rows are read for it.

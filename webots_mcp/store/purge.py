@@ -471,8 +471,6 @@ class Upkeep:
     def __call__(self, connection: sqlite3.Connection) -> None:
         """Delete for a moment, if anything exceeds the limits.
 
-        468.sqlite3.Error, DatabaseError: The next call starts with a new plan.
-
         Raises:
             sqlite3.Error, DatabaseError: The next call begins with a new plan.
         """

@@ -18,7 +18,7 @@ from tests.bridge.conftest import STEP_MS, Recording
 from tests.bridge.keeping.conftest import State, rows
 from tests.bridge.monsters import MONSTERS, EndlessDict
 from webots_mcp import MCPBridge
-from webots_mcp.bridge import cleaning
+from webots_mcp.bridge import json_cleaning
 from webots_mcp.bridge.encoding import encode
 from webots_mcp.bridge.ring import Ring, RingRow
 from webots_mcp.bridge.state_pickles import copy_or_encode, encode_copy
@@ -84,7 +84,7 @@ def test_any_state_that_is_held_is_kept_as_it_would_be_recorded(state: State) ->
 def test_a_monster_that_is_held_is_kept_as_it_would_be_recorded(
     make: Callable[[], Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(cleaning, "OBJECTS_BUDGET_S", math.inf)
+    monkeypatch.setattr(json_cleaning, "OBJECTS_BUDGET_S", math.inf)
     EndlessDict.asked = 0
     held = copy_or_encode({"monster": make()})
     kept = encode_copy(held) if isinstance(held, bytes) else held

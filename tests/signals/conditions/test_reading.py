@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from webots_mcp.bridge import cleaning
+from webots_mcp.bridge import json_cleaning
 from webots_mcp.bridge.encoding import encode, plain
 from webots_mcp.signals.conditions.signal_values import reader
 from webots_mcp.signals.naming import flatten
@@ -75,7 +75,7 @@ NAMES = ("a", "a.b", "b.0", "a.1", "a.b.min", "1", "null", "a.mean", "0.a", "Tru
 def all_the_time_that_objects_need() -> Iterator[None]:
     """A row holds null for an object that is read on a machine too busy for it."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(cleaning, "OBJECTS_BUDGET_S", 60.0)
+        patch.setattr(json_cleaning, "OBJECTS_BUDGET_S", 60.0)
         yield
 
 

@@ -60,7 +60,7 @@ RunId = Annotated[
     Id | None, Field(description="Run to ask about, from webots_list_runs. Default: the newest.")
 ]
 TrialSetId = Annotated[
-    Id | None, Field(description="Number of a set of trials, from webots_run_trials.")
+    Id | None, Field(description="Number of a set of trials, from the answer that began it.")
 ]
 LastS = Annotated[_Duration | None, Field(description="Only the last N simulated seconds.")]
 StartS = Annotated[Seconds | None, Field(description="Start of the range in simulated seconds.")]

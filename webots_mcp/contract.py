@@ -30,6 +30,7 @@ PROJECT_FILE: Final = "webots-mcp.toml"  # beside that folder: what is expected 
 CAMERA_FOLDER: Final = "camera"
 SCREENSHOT_FOLDER: Final = "screenshots"
 SCENE_FOLDER: Final = "scenes"  # movies and animations of the simulation
+LOG_CHARACTERS: Final = 10_000  # of a log line that are stored; WMCP_MAX_LOG of webots_mcp.h too
 MAX_CAMERA_PICTURES: Final = 50  # of a camera that are stored; older ones are deleted
 KEPT_FRAME: Final = "kept"  # the kind of a picture that belongs to the kept stretch it lies in
 DATA_DIR_VARIABLE: Final = "WEBOTS_MCP_DATA_DIR"

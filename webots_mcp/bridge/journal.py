@@ -11,7 +11,7 @@ from webots_mcp.bridge.error_report import cut, storable
 from webots_mcp.bridge.json_cleaning import BYTES_AS_TEXT, TEXT_WITH_SURROGATES, TOO_LARGE
 from webots_mcp.bridge.recorder import Recorder
 from webots_mcp.bridge.simulation import Clock
-from webots_mcp.contract import HEARTBEAT_INTERVAL_S
+from webots_mcp.contract import HEARTBEAT_INTERVAL_S, LOG_CHARACTERS
 from webots_mcp.database.heartbeat import LoopStatus
 from webots_mcp.database.pause_states import PAUSED
 
@@ -28,7 +28,7 @@ class JournalLogLimits(NamedTuple):
         lost_paths: Paths that a line about lost values names.
     """
 
-    message_characters: int = 10_000
+    message_characters: int = LOG_CHARACTERS
     logger_characters: int = 200
     lost_paths: int = 20
 

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import PurePath
 from typing import Any, Final, NamedTuple
 
-from webots_mcp.contract import LOG_LEVELS, LogLevel, LogSource
+from webots_mcp.contract import LOG_CHARACTERS, LOG_LEVELS, LogLevel, LogSource
 from webots_mcp.store.reading.ranges import Scope, moment_of
 from webots_mcp.store.run_rows import columns_of
 
@@ -76,7 +76,7 @@ class ConsoleLimits:
     recorded_rows: int = 2_000
     logged_texts: int = 500
     compared_s: float = 60.0
-    message_characters: int = 10_000
+    message_characters: int = LOG_CHARACTERS
 
 
 _CONSOLE: Final = ConsoleLimits()

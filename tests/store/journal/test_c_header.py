@@ -23,7 +23,7 @@ from mcp import Client
 from tests.exploring import attempts
 from tests.waiting import wait_for
 from webots_mcp.cli import main
-from webots_mcp.contract import C_HEADER
+from webots_mcp.contract import C_HEADER, LOG_CHARACTERS
 from webots_mcp.database.waiting_file import journal_parts
 from webots_mcp.server.mcp_server import create_server
 from webots_mcp.store.recording import RecordingAccess
@@ -372,6 +372,11 @@ def test_a_folder_that_is_missing_stops_nothing(start: Start, tmp_path: Path, lo
     assert dropped == [(int(loss == "a file in its place"),)]
     end(process)
     assert read(folder, "SELECT count(*) FROM run WHERE end_reason = 'finished'") == [(1,)]
+
+
+def test_the_header_cuts_a_log_line_where_python_does() -> None:
+    header = C_HEADER.read_text("utf-8")
+    assert f"#define WMCP_MAX_LOG {LOG_CHARACTERS}\n" in header
 
 
 def test_the_command_writes_the_header_and_no_other_file(

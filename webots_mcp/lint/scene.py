@@ -165,7 +165,12 @@ class ProtoSource(NamedTuple):
 
 
 class UnknownField(NamedTuple):
-    """The PROTO that lacks a field which a node gives it."""
+    """A field that a node sets, but its PROTO does not declare.
+
+    Attributes:
+        type_name: Name of the PROTO.
+        source: Its source.
+    """
 
     type_name: str
     source: ProtoSource

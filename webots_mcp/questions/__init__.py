@@ -25,7 +25,10 @@ MODULES: Final = (
 
 
 def all_questions() -> list[Question]:
-    """Return every question there is, once; a module may use those of others."""
+    """Return every question there is, once; a module may use those of others.
+
+    It imports all of them: for the list of tools, the documentation and tests.
+    """
     from webots_mcp.questions.declaration import Question
 
     modules = [importlib.import_module(f"{__name__}.{name}") for name in MODULES]

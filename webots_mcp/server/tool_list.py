@@ -1,6 +1,6 @@
 """The list of tools, read from a file, so that a server imports no question before it is asked.
 
-Making the list from the questions would lengthen the start of a server by a quarter.
+Making the list from the questions would lengthen the start of a server by a fifth.
 `python -m tests.tool_list --write` makes the file `tool_list.json` from them, a tool on each line.
 """
 

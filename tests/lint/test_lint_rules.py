@@ -321,6 +321,13 @@ def test_a_legal_field_that_no_rule_reads_is_no_slip(tmp_path: Path, legal: str)
     assert not faults_of(lint(tmp_path, legal), "file")
 
 
+def test_faults_of_one_line_come_in_the_order_of_the_file(tmp_path: Path) -> None:
+    fields = ("controler", "supervisr", "selfColision", "boundingobject", "nam")
+    text = "Robot { " + " ".join(f"{each} 1" for each in fields) + " }"
+    found = [fault.path.rpartition(".")[2] for fault in faults_of(lint(tmp_path, text), "file")]
+    assert found == [*fields]
+
+
 def test_a_misspelt_field_beside_the_right_one_is_to_be_removed(tmp_path: Path) -> None:
     (fault,) = faults_of(lint(tmp_path, 'Robot { controller "void" controler "x" }'), "file")
     assert "it has controller, which is given too" in fault.what

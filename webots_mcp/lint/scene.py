@@ -431,7 +431,7 @@ class Scene:
 
     def _note_unknown(self, node: WorldNode, source: ProtoSource) -> None:
         """Note fields that the PROTO does not declare."""
-        for name in node.fields.keys() - source.fields.keys():
+        for name in (each for each in node.fields if each not in source.fields):
             file, line = node.file or self.world, node.field_lines.get(name, node.line)
             self.unknown_fields[file, line, name] = UnknownField(node.type_name, source)
 

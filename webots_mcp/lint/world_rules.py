@@ -102,7 +102,7 @@ class WorldRules:
         seen: set[tuple[Path, int, str]] = set()  # a line of a PROTO is in each of its instances
         for node in self._scene.nodes:
             types = NODE_TYPES.get("" if node.unread else node.type_name, _NO_FIELDS)
-            for name in node.fields.keys() - types.keys():
+            for name in (each for each in node.fields if each not in types):
                 near = _misspelt(name, types)
                 place = node.file, node.line_of(name), name
                 if not near or place in seen:
